@@ -156,20 +156,14 @@ def checked_robot(data: dict[str, Any], where: str) -> RobotConfig:
 
 
 def load_inertials(name: str | Path) -> UrdfInertials | None:
-    """Load the masses of a robot from the URDF of its configuration; ``None`` if it names no URDF.
-
-    ``name``: as of `config_path`. ConfigError, with file and element, if a file is missing or wrong.
-    """
+    """Load the masses of a robot from the URDF of its configuration; ``None`` if it names no URDF."""
     path = config_path(name)
     given = _urdf_geometry(_marked(path), path)
     return None if given is None else read_inertials(urdf_file(given, path), given.urdf.base, given.urdf.tip)
 
 
 def load_shapes(name: str | Path) -> UrdfShapes | None:
-    """Load the shapes of the links of a robot from the URDF of its configuration; ``None`` if it names no URDF.
-
-    ``name``: as of `config_path`. ConfigError, with file and element, if a file is missing or wrong.
-    """
+    """Load the shapes of the links of a robot from the URDF of its configuration; ``None`` if it names no URDF."""
     path = config_path(name)
     given = _urdf_geometry(_marked(path), path)
     return None if given is None else read_shapes(urdf_file(given, path), given.urdf.base, given.urdf.tip)

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from armident.arrays import Array
 from armident.configs.errors import ConfigError
 from armident.configs.schema.robot import Mdh
 
@@ -22,8 +23,6 @@ FARTHEST = 100.0
 """Largest distance of a common normal, as a multiple of the chain's size. Beyond it the parameters about the normal are
 not distinguishable numerically."""
 
-Floats = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class MdhChain:
@@ -32,9 +31,9 @@ class MdhChain:
     ``base`` (4, 4): frame 0 in the frame of the axes, z along the first; ``frames`` (n, 4, 4): 1 to n in it, at zero.
     """
 
-    base: Floats
+    base: Array
     parameters: tuple[Mdh, ...]
-    frames: Floats
+    frames: Array
 
 
 def modified_dh(axes: ArrayLike, points: ArrayLike, names: Sequence[str]) -> MdhChain:
@@ -79,7 +78,7 @@ def modified_dh(axes: ArrayLike, points: ArrayLike, names: Sequence[str]) -> Mdh
     return MdhChain(base, tuple(parameters), frames)
 
 
-def _common_normal(z: Floats, p: Floats, j: int, x: Floats, foot: Floats) -> tuple[Floats, Floats, bool]:
+def _common_normal(z: Array, p: Array, j: int, x: Array, foot: Array) -> tuple[Array, Array, bool]:
     """Direction of the normal of axes j and j+1, its point on axis j, and True if the axes are parallel."""
     if j + 1 == z.shape[0]:
         return x, foot, False
@@ -94,20 +93,20 @@ def _common_normal(z: Floats, p: Floats, j: int, x: Floats, foot: Floats) -> tup
     return (across / distance if distance > COINCIDENT else x), foot, True
 
 
-def _across(z: Floats) -> Floats:
+def _across(z: Array) -> Array:
     """Unit vector orthogonal to ``z``: the given x made orthogonal, or y where x is too close to ``z``."""
     unit = np.eye(3)[0 if abs(z[0]) < np.sqrt(0.75) else 1]
-    across: Floats = unit - (unit @ z) * z
+    across: Array = unit - (unit @ z) * z
     return across / np.linalg.norm(across)
 
 
-def _frame(x: Floats, z: Floats, origin: Floats) -> Floats:
+def _frame(x: Array, z: Array, origin: Array) -> Array:
     frame = np.eye(4)
     frame[:3] = np.column_stack([x, np.cross(z, x), z, origin])
     return frame
 
 
-def _angle(a: Floats, b: Floats, about: Floats) -> float:
+def _angle(a: Array, b: Array, about: Array) -> float:
     """Angle from ``a`` to ``b``, both orthogonal to ``about``, rad."""
     return float(np.arctan2(np.cross(a, b) @ about, a @ b))
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict
 
+from armident.arrays import Array
 from armident.configs.errors import ConfigError
 from armident.configs.mdh import MdhChain, modified_dh
 from armident.configs.schema.base import FrozenModel
@@ -126,14 +126,14 @@ def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
     return {"joints": plain, "gravity": [float(g) for g in np.where(np.abs(gravity) < 1e-14, 0.0, gravity)]} | bodies
 
 
-def link_placements(joints: tuple[UrdfJoint, ...], names: list[str], chain: MdhChain) -> dict[str, NDArray[np.float64]]:
+def link_placements(joints: tuple[UrdfJoint, ...], names: list[str], chain: MdhChain) -> dict[str, Array]:
     """Frames (4, 4) of the moved links of a URDF, and of its base link, in the frames of the chain, by link."""
     moved = zip(names, chain.frames, joints, strict=True)
-    base: dict[str, NDArray[np.float64]] = {BASE: np.asarray(np.linalg.inv(chain.base))}
+    base: dict[str, Array] = {BASE: np.asarray(np.linalg.inv(chain.base))}
     return base | {name: np.asarray(np.linalg.solve(frame, joint.placement)) for name, frame, joint in moved}
 
 
-def _in_frames_of_the_chain(given: Collision, frames: dict[str, NDArray[np.float64]], where: Path) -> Collision:
+def _in_frames_of_the_chain(given: Collision, frames: dict[str, Array], where: Path) -> Collision:
     """Bodies with boxes in frame 0 and capsules in frames j."""
     boxes, capsules = [], []
     for box in given.boxes:
@@ -148,12 +148,8 @@ def _in_frames_of_the_chain(given: Collision, frames: dict[str, NDArray[np.float
     return given.model_copy(update={"boxes": tuple(boxes), "capsules": tuple(capsules)})
 
 
-def _point(frame: NDArray[np.float64], point: tuple[float, float, float]) -> tuple[float, float, float]:
-    return _triple(frame[:3, :3] @ point + frame[:3, 3])
-
-
-def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in values)
+def _point(frame: Array, point: tuple[float, float, float]) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in frame[:3, :3] @ point + frame[:3, 3])
     return x, y, z
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs.errors import ConfigError
 from armident.configs.urdf import mdh_of
 from armident.configs.urdf_element import end_link, only, words
@@ -18,8 +18,6 @@ INERTIAL = ("xx", "xy", "xz", "yy", "yz", "zz", "mx", "my", "mz", "m")
 
 ROUNDING = 0.01
 """Share of a moment of inertia by which rounded numbers may break the triangle inequality: two written digits."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -41,10 +39,7 @@ class UrdfInertials:
 
 
 def read_inertials(file: Path, base: str | None = None, tip: str | None = None) -> UrdfInertials:
-    """Masses of the links between two links of a URDF, and friction of its joints; errors name file and element.
-
-    Links on fixed joints belong to the link that carries them, and everything after the tip to the last link.
-    """
+    """Masses of the links between two links of a URDF, and friction of its joints; errors name file and element."""
     joints = read_chain(file, base, tip)
     frames = mdh_of(joints, file).frames
     tree = read_tree(file)
@@ -89,9 +84,9 @@ def held_joints(file: Path, base: str | None = None, tip: str | None = None) -> 
     return tuple(joint for _, _, _, joint in links if joint is not None)
 
 
-def carried_links(tree: UrdfTree, base: str, chain: list[str]) -> Iterator[tuple[str, int, Floats, str | None]]:
+def carried_links(tree: UrdfTree, base: str, chain: list[str]) -> Iterator[tuple[str, int, Array, str | None]]:
     """Links below the base: name, index of the joint that moves it (-1: none), placement, joint that is held still."""
-    todo: list[tuple[str, int, Floats]] = [(base, -1, np.eye(4))]
+    todo: list[tuple[str, int, Array]] = [(base, -1, np.eye(4))]
     while todo:
         link, owner, placement = todo.pop()
         for element in tree.below.get(link, []):
@@ -107,7 +102,7 @@ def carried_links(tree: UrdfTree, base: str, chain: list[str]) -> Iterator[tuple
             todo.append((child, here, frame))
 
 
-def _moments(tree: UrdfTree, link: ET.Element) -> tuple[Floats, bool]:
+def _moments(tree: UrdfTree, link: ET.Element) -> tuple[Array, bool]:
     """Pseudo-inertia (4, 4) of a link (Wensing, Kim and Slotine 2018), and False if no body has such moments."""
     inertial = only(tree.file, link, "inertial")
     if inertial is None:

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from decimal import Decimal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from armident.arrays import Array
 
 WRITTEN_DECIMALS = 4
 """Minimum number of decimals of an angle that is rounded to the multiple of 15 degrees with the same decimals."""
@@ -20,20 +21,18 @@ LENGTH_TOLERANCE = 0.01
 EXACT = 1e-12
 """Largest distance of an element of a rotation matrix from 0 or 1 that is rounding of double precision."""
 
-Floats = NDArray[np.float64]
 
-
-def rotation(roll: float, pitch: float, yaw: float) -> Floats:
+def rotation(roll: float, pitch: float, yaw: float) -> Array:
     """Rotation matrix of URDF's fixed-axis angles, exact for right angles: ``Rot(z, y) Rot(y, p) Rot(x, r)``."""
     (cr, sr), (cp, sp), (cy, sy) = (_cos_sin(angle) for angle in (roll, pitch, yaw))
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
     about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
     about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    matrix: Floats = about_z @ about_y @ about_x
+    matrix: Array = about_z @ about_y @ about_x
     return matrix
 
 
-def fixed_axis_angles(matrix: Floats) -> tuple[float, float, float]:
+def fixed_axis_angles(matrix: Array) -> tuple[float, float, float]:
     """Fixed-axis angles ``roll, pitch, yaw`` of a rotation, rad; yaw is 0 at a pitch of 90 degrees."""
     pitch = math.atan2(-matrix[2, 0], math.hypot(matrix[0, 0], matrix[1, 0]))
     if math.hypot(matrix[0, 0], matrix[1, 0]) < EXACT:
@@ -60,7 +59,7 @@ def rounded_angle(word: str) -> float:
     return multiple if abs(value - multiple) < tolerance else value
 
 
-def rotation_of_quaternion(quaternion: Sequence[float]) -> Floats:
+def rotation_of_quaternion(quaternion: Sequence[float]) -> Array:
     """Rotation matrix of a quaternion ``x, y, z, w`` of length 1 (else ValueError), exact for right angles."""
     values = np.array(quaternion, dtype=np.float64)
     length = float(np.linalg.norm(values))
@@ -75,5 +74,5 @@ def rotation_of_quaternion(quaternion: Sequence[float]) -> Floats:
         ]
     )
     whole = np.round(matrix)
-    exact: Floats = np.where(np.abs(matrix - whole) < EXACT, whole + 0.0, matrix)
+    exact: Array = np.where(np.abs(matrix - whole) < EXACT, whole + 0.0, matrix)
     return exact

@@ -7,8 +7,8 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs.errors import ConfigError
 from armident.configs.schema.collision import BASE
 from armident.configs.urdf import joint_names, link_placements, mdh_of
@@ -16,8 +16,6 @@ from armident.configs.urdf_element import words
 from armident.configs.urdf_inertials import carried_links
 from armident.configs.urdf_tree import UrdfTree, read_chain, read_tree
 from armident.configs.yaml_loader import is_file
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +26,7 @@ class UrdfShape:
     """
 
     link: str
-    placement: Floats
+    placement: Array
     kind: str
     size: tuple[float, ...]
     mesh: Path | None = None
@@ -65,7 +63,7 @@ def read_shapes(file: Path, base: str | None = None, tip: str | None = None) -> 
     return UrdfShapes(tuple(shapes), tuple(missing))
 
 
-def _shapes_of(tree: UrdfTree, link: ET.Element, name: str, frame: Floats) -> Iterator[UrdfShape]:
+def _shapes_of(tree: UrdfTree, link: ET.Element, name: str, frame: Array) -> Iterator[UrdfShape]:
     """Shapes of one link element whose frame is given in frame j."""
     for element in link.findall("collision") or link.findall("visual"):
         geometry = element.find("geometry")

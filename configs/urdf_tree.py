@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs.errors import ConfigError
 from armident.configs.suspected_units import FULL_TURN, LONGEST_LINK
 from armident.configs.urdf_element import end_link, only, words
@@ -27,8 +27,6 @@ ENDLESS = (-math.inf, math.inf)
 COARSE = 1e-4
 """Rounding of an angle, rad, from which on it is named: four decimals or more are what files usually have."""
 
-Floats = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class UrdfJoint:
@@ -39,8 +37,8 @@ class UrdfJoint:
 
     name: str
     type: str
-    placement: Floats
-    axis: Floats
+    placement: Array
+    axis: Array
     limits: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -93,7 +91,7 @@ def moving_links(file: Path, base: str | None, tip: str) -> list[tuple[str, str]
     ]
 
 
-def orientation(file: Path, link: str) -> Floats:
+def orientation(file: Path, link: str) -> Array:
     """Rotation (3, 3) of a link in the root of a URDF with all joints at zero; raises ConfigError if it is missing."""
     tree = read_tree(file)
     turned = np.eye(3)
@@ -199,7 +197,7 @@ class UrdfTree:
         """Return the URDF type of a joint."""
         return element.get("type", "")
 
-    def origin(self, element: ET.Element, found: ET.Element | None) -> Floats:
+    def origin(self, element: ET.Element, found: ET.Element | None) -> Array:
         """Placement (4, 4) of a joint in its parent link, or of an inertia in its link; ``None``: no offset."""
         frame = np.eye(4)
         if found is not None:
@@ -208,7 +206,7 @@ class UrdfTree:
             self._refuse_millimetres(element, frame[:3, 3])
         return frame
 
-    def _orientation(self, element: ET.Element, origin: ET.Element) -> Floats:
+    def _orientation(self, element: ET.Element, origin: ET.Element) -> Array:
         """Rotation of a joint's frame in its parent link, by ``rpy`` or (URDF 1.1) ``quat_xyzw``, shape (3, 3)."""
         where = f"{self.file}: {element.tag} {element.get('name')!r}: origin"
         for key in sorted(set(origin.keys()) - {"xyz", "rpy", "quat_xyzw"}):
@@ -226,14 +224,14 @@ class UrdfTree:
         except ValueError as error:
             raise ConfigError(f"{where} quat_xyzw: {error}") from error
 
-    def _refuse_millimetres(self, element: ET.Element, xyz: Floats) -> None:
+    def _refuse_millimetres(self, element: ET.Element, xyz: Array) -> None:
         """Refuse a distance between joints that no arm has; the frame of the first joint may be anywhere."""
         farthest = float(np.abs(xyz).max())
         if farthest > LONGEST_LINK and end_link(element, "parent") in self.above:
             where = f"{self.file}: {element.tag} {element.get('name')!r}: origin xyz"
             raise ConfigError(f"{where}: {farthest:g} looks like millimetres; expected m")
 
-    def moving_joint(self, element: ET.Element, placement: Floats) -> UrdfJoint:
+    def moving_joint(self, element: ET.Element, placement: Array) -> UrdfJoint:
         """Return a moving joint with its frame (4, 4) in the base link, all variables zero; ConfigError if unusable."""
         where = f"{self.file}: {element.tag} {element.get('name')!r}"
         kind = self.type_of(element)

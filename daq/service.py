@@ -220,10 +220,7 @@ def _system(cell: str, root: Path, executable: Path | None) -> System:
 
 
 def install(cell: str, root: Path = Path("/"), executable: Path | None = None, dry_run: bool = False) -> list[str]:
-    """Install the service of a cell, and return the lines of a report; nothing is enabled or started.
-
-    By default ``executable`` is that of this environment; in a system image (``root``) it is in ``/opt/armident/bin``.
-    """
+    """Install the service of a cell, and return the lines of a report; nothing is enabled or started."""
     system = _system(cell, root, executable)
     with_sudo = f"sudo {system.executable} service install {cell}"
     try:
@@ -285,10 +282,7 @@ def _state(step: InstallStep) -> str:
 
 
 def uninstall(cell: str, root: Path = Path("/"), dry_run: bool = False) -> list[str]:
-    """Stop, disable and remove the services of a cell, and return the lines of a report.
-
-    Shared files go with the last cell. Recordings, results, configurations and their user are kept.
-    """
+    """Stop, disable and remove the services of a cell, but no recordings; return the lines of a report."""
     system = _system(cell, root, Path(SHIPPED_EXECUTABLE))
     try:
         open_steps = list(_removals(system, cell))

@@ -5,6 +5,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.scenario import Scenario
 from armident.configs.units import counts_per_si
@@ -143,7 +144,7 @@ class Arm:
         if self._signals.acts:
             self._distort(measured, disturbance)
 
-    def _distort(self, noise: NDArray[np.float64], disturbance: NDArray[np.float64]) -> None:
+    def _distort(self, noise: Array, disturbance: Array) -> None:
         """Apply hidden errors of amplifiers, wiring and names between drives, plant and bus."""
         signals, (position, current, demand) = self._signals, self._own
         self._tau[:] = signals.applied(self._current)
@@ -157,16 +158,13 @@ class Arm:
 
 def design_drives(
     robot: RobotConfig,
-    mass: NDArray[np.float64],
+    mass: Array,
     velocity_feedback: bool | None,
     period: float,
     scenario: Scenario | None,
     parameters: ArmParameters,
 ) -> servo.Servo:
-    """Design the drives of a virtual arm: gains of the scenario, else of its configuration, else tuned ones.
-
-    ``mass`` (n, n): of the healthy arm at power-on, joint side, with rotors. Raises ConfigError if gains do not fit.
-    """
+    """Design the drives of a virtual arm: gains of the scenario, else of its configuration, else tuned ones."""
     given = None if scenario is None or scenario.controller is None else scenario.controller
     known = None if given is None else given.gains
     if known is not None and not len(known.kp) == len(known.kv) == robot.n:

@@ -45,11 +45,7 @@ def arm_parameters(
     inertials: UrdfInertials | None = None,
     seed: int = 0,
 ) -> ArmParameters:
-    """Parameters of the virtual arm of a robot with limits of position, velocity and acceleration.
-
-    Masses are those of ``model``, else of the URDF, else those shipped (TX40, EMPS), else drawn from ``seed``. Raises
-    ConfigError if the document is of another robot, or a joint has no inertia.
-    """
+    """Parameters of the virtual arm of a robot with limits of position, velocity and acceleration."""
     if model is not None:
         identified = read_identified(model, robot)
         found = _completed(robot, identified.standard, identified.sources, seed)

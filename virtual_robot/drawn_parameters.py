@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import pinocchio
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.urdf_inertials import INERTIAL
 from armident.virtual_robot.model import build_model
 
 pin: Any = pinocchio
-Floats = NDArray[np.float64]
 
 TORQUE_SHARE = 0.3
 """Share of the torque limit that gravity and acceleration take at the joint that has the least reserve."""
@@ -44,9 +43,9 @@ class TorqueScale:
     ``inertia``: mean diagonal of the mass matrix with rotors; ``gravity``: rms; ``torque``: with acceleration.
     """
 
-    inertia: Floats
-    gravity: Floats
-    torque: Floats
+    inertia: Array
+    gravity: Array
+    torque: Array
 
 
 def log_uniform(rng: np.random.Generator, limits: tuple[float, float], size: int | None = None) -> Any:
@@ -54,7 +53,7 @@ def log_uniform(rng: np.random.Generator, limits: tuple[float, float], size: int
     return np.exp(rng.uniform(np.log(limits[0]), np.log(limits[1]), size))
 
 
-def random_body(rng: np.random.Generator, size: float, mass: float) -> tuple[Floats, Floats]:
+def random_body(rng: np.random.Generator, size: float, mass: float) -> tuple[Array, Array]:
     """Draw a body, m, kg, that exists: centre of mass, m, (3,), and second moments about it, kg m^2, (3, 3)."""
     com = rng.normal(size=3) * size * np.array([0.4, 0.15, 0.3])
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -79,7 +78,7 @@ def draw_bodies(robot: RobotConfig, seed: int) -> dict[str, float]:
     return {name: value * factor for name, value in standard.items()}
 
 
-def needed_torque(robot: RobotConfig, standard: Mapping[str, float]) -> Floats:
+def needed_torque(robot: RobotConfig, standard: Mapping[str, float]) -> Array:
     """Torque (n,) for gravity and a large acceleration, N m or N; of ``standard`` only the links count."""
     load = torque_scale(robot, {name: value for name, value in standard.items() if not name.startswith("ia")})
     rise = np.array([min(j.limits.acceleration, RISE_PER_S * j.limits.velocity) for j in robot.joints])
@@ -87,7 +86,7 @@ def needed_torque(robot: RobotConfig, standard: Mapping[str, float]) -> Floats:
     return np.asarray(2.0 * load.inertia * rise + load.gravity)
 
 
-def _next_origin(robot: RobotConfig, j: int) -> Floats:
+def _next_origin(robot: RobotConfig, j: int) -> Array:
     """Origin of frame j + 1 in frame j at zero, m; zero for the last link."""
     if j + 1 == robot.n:
         return np.zeros(3)
@@ -95,7 +94,7 @@ def _next_origin(robot: RobotConfig, j: int) -> Floats:
     return np.array([mdh.d, -np.sin(mdh.alpha) * mdh.r, np.cos(mdh.alpha) * mdh.r])
 
 
-def _standard(link: int, mass: float, com: Floats, second: Floats) -> dict[str, float]:
+def _standard(link: int, mass: float, com: Array, second: Array) -> dict[str, float]:
     """Inertial parameters of a body about the origin of its frame, of its second moments (3, 3) about ``com``."""
     moments = second + mass * np.outer(com, com)
     inertia = np.trace(moments) * np.eye(3) - moments

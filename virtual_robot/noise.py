@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 
 
@@ -61,10 +61,10 @@ class Noise:
         self._random = np.random.default_rng(seed)
         self._last = self._disturbance * self._random.standard_normal(n)
         self._row = BLOCK
-        self.current: NDArray[np.float64] = np.zeros((BLOCK, n))
-        self.disturbance: NDArray[np.float64] = np.zeros((BLOCK, n))
+        self.current: Array = np.zeros((BLOCK, n))
+        self.disturbance: Array = np.zeros((BLOCK, n))
 
-    def next(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def next(self) -> tuple[Array, Array]:
         """Noise on the measured signals (A or V) and disturbance torques (N m, joint side), shape (n,) each."""
         if self._row == BLOCK:
             self._refill()
@@ -82,7 +82,7 @@ class Noise:
 
 def amplitudes(
     robot: RobotConfig, period: float, size: NoiseSize | None = None, averaged: int = 1
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     """Standard deviations (n,) of both parts of the noise, N m or N.
 
     White: torque of a motor, motor side, mean of ``averaged`` periods. Slow: torque of a joint, corner

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig, Trajectory
 from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.trajectory import check_motion
@@ -29,8 +30,8 @@ COUNTER = 240
 class ReferenceTable:
     """Reference positions as a table: times (N,), s, and positions (N, n), rad or m; cubic between the rows."""
 
-    t: NDArray[np.float64]
-    q: NDArray[np.float64]
+    t: Array
+    q: Array
 
     @classmethod
     def read(cls, path: Path) -> "ReferenceTable":
@@ -53,7 +54,7 @@ class ReferenceTable:
         """Positions of the first row, rad or m, (n,)."""
         return tuple(self.q[0].tolist())
 
-    def sample(self, period: float) -> NDArray[np.float64]:
+    def sample(self, period: float) -> Array:
         """Return the positions (M, n), rad or m, at multiples of a period, s."""
         times = np.arange(round(float(self.t[-1]) / period) + 1) * period
         return np.asarray(CubicSpline(self.t, self.q)(np.minimum(times, self.t[-1])))
@@ -119,7 +120,8 @@ def simulate_recording(
         "samples", 1, sync, times(sync), sample_fields(robot),
         {"position": position, effort_of(robot): current, "status": np.full((total, n), OPERATION_ENABLED, np.uint16)},
     )  # fmt: skip
-    demands = Stream("demand", every, knots, times(knots), demand_fields(robot), {"demand": demand})
+    fields = {"demand": Field("demand", "demand", _position_unit(robot), "motor", _per_count(robot))}
+    demands = Stream("demand", every, knots, times(knots), fields, {"demand": demand})
     marks = (
         Mark("experiment_start", first, start_ns + first * step_ns),
         Mark("experiment_end", last, start_ns + last * step_ns),
@@ -154,11 +156,6 @@ def sample_fields(robot: RobotConfig) -> dict[str, Field]:
         effort: Field(effort, effort, unit, "motor", rated),
         "status": Field("status", "status", "", "motor", (1.0,) * robot.n),
     }
-
-
-def demand_fields(robot: RobotConfig) -> dict[str, Field]:
-    """Field of the ``demand`` stream: demanded motor positions."""
-    return {"demand": Field("demand", "demand", _position_unit(robot), "motor", _per_count(robot))}
 
 
 def _position_unit(robot: RobotConfig) -> str:

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.scenario import Scenario
 from armident.virtual_robot import dynamics
@@ -77,7 +78,7 @@ class Plant:
         link = np.arange(n)
         link[behind] = n + np.arange(soft)
         self._link = np.concatenate([link, np.arange(n + soft, total)])
-        self.rotor: NDArray[np.float64] = np.zeros((total, total))
+        self.rotor: Array = np.zeros((total, total))
         self.rotor[:n, :n] = rotor
         self.rotor[behind, behind] += moved
         self.rotor[link[behind], link[behind]] -= moved
@@ -104,7 +105,7 @@ class Plant:
         self._rigid, self._fine = total == n, bool(gears.size or bristles.size)
         self._check(robot, hidden)
 
-    def _least_inertia(self, robot: RobotConfig, rotor: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _least_inertia(self, robot: RobotConfig, rotor: Array) -> Array:
         """Least inertia at each joint if all others are free, over random postures within the limits, shape (n,)."""
         n, least = robot.n, np.full(robot.n, np.inf)
         low, high = np.array([joint.limits.position for joint in robot.joints]).T
@@ -114,7 +115,7 @@ class Plant:
             least = np.minimum(least, 1.0 / np.diag(np.linalg.inv(mass)))
         return least
 
-    def _settle(self, start: NDArray[np.float64], gears: NDArray[np.float64], soft: int) -> NDArray[np.float64]:
+    def _settle(self, start: Array, gears: Array, soft: int) -> Array:
         """Twist the first ``soft`` gears under the weight of their links; return the nonlinear effects at rest."""
         for _ in range(SETTLING if soft else 1):
             bias = pin.nonLinearEffects(self.model, self._data, self.coordinates[self._link], np.zeros(self._link.size))
@@ -126,7 +127,7 @@ class Plant:
         if hidden and np.linalg.eigvalsh(self._inertia(self.coordinates)).min() <= 0.0:
             raise ConfigError(f"{hidden[0].where}: robot {robot.name!r} is left without inertia by its hidden effects")
 
-    def mass_matrix(self) -> NDArray[np.float64]:
+    def mass_matrix(self) -> Array:
         """Mass matrix at the present position, joint side, shape (n, n), rotors included, with rigid gears."""
         n = self.q.size
         position = self.coordinates[self._link]
@@ -135,10 +136,10 @@ class Plant:
         for j in range(n):
             if self._link[j] != j:
                 folded[j, j] += self.rotor[self._link[j], self._link[j]]
-        mass: NDArray[np.float64] = _symmetric(pin.crba(self.model, self._data, position))[:n, :n] + folded
+        mass: Array = _symmetric(pin.crba(self.model, self._data, position))[:n, :n] + folded
         return mass
 
-    def resistance(self, q: NDArray[np.float64], qd: NDArray[np.float64], t: float = 0.0) -> NDArray[np.float64]:
+    def resistance(self, q: Array, qd: Array, t: float = 0.0) -> Array:
         """Torques (n,) of friction, brakes and hidden effects against the motors, N m or N; bristles slide steadily."""
         n = q.size
         out, slope = np.empty(n), np.empty((n, n))
@@ -149,9 +150,7 @@ class Plant:
             out[j] += np.sign(qd[j]) * sliding_level(row, qd[j])[0]
         return out
 
-    def acceleration(
-        self, q: NDArray[np.float64], qd: NDArray[np.float64], tau: NDArray[np.float64], t: float = 0.0
-    ) -> NDArray[np.float64]:
+    def acceleration(self, q: Array, qd: Array, tau: Array, t: float = 0.0) -> Array:
         """Accelerations (N,) at torques (n,), N m or N, without `advance`'s approximations; bristles slide steadily."""
         n, total = self.q.size, self.coordinates.size
         force, slope = np.zeros(total), np.zeros((total, total))
@@ -162,7 +161,7 @@ class Plant:
         force[self._link] += pin.nonLinearEffects(self.model, self._data, q[self._link], qd[self._link])
         return np.asarray(np.linalg.solve(self._inertia(q), -force), np.float64)
 
-    def advance(self, tau: NDArray[np.float64], period: float) -> None:
+    def advance(self, tau: Array, period: float) -> None:
         """Integrate over one control period with constant torques. ``tau``: joint torques, N m or N, shape (n,)."""
         if self._vibrations.size:
             self._add_base_vibration(self._time + 0.5 * period)
@@ -181,7 +180,7 @@ class Plant:
         dynamics.advance(*arguments)
         self._time += period
 
-    def _inertia(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _inertia(self, q: Array) -> Array:
         mass = self.rotor.copy()
         rows, columns = np.ix_(self._link, self._link)
         mass[rows, columns] += _symmetric(pin.crba(self.model, self._data, q[self._link]))
@@ -193,9 +192,7 @@ class Plant:
         self.model.gravity.linear = self._gravity - np.sin(rows[:, 3] * t) @ rows[:, :3]
 
 
-def _healthy(
-    robot: RobotConfig, standard: Mapping[str, float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], list[tuple[float, ...]]]:
+def _healthy(robot: RobotConfig, standard: Mapping[str, float]) -> tuple[Array, Array, list[tuple[float, ...]]]:
     """Rotor inertias (n, n); fv, fc, offset and brake of each joint (n, 4); couplings (joints, fv, fc)."""
     n, names = robot.n, [joint.name for joint in robot.joints]
     rotor = np.diag([standard[f"ia{j + 1}"] for j in range(n)])
@@ -208,9 +205,7 @@ def _healthy(
     return rotor, friction, pairs
 
 
-def _add_coupling_friction(
-    hidden: Sequence[Hidden], friction: NDArray[np.float64], pairs: list[tuple[float, ...]]
-) -> None:
+def _add_coupling_friction(hidden: Sequence[Hidden], friction: Array, pairs: list[tuple[float, ...]]) -> None:
     """Add hidden friction between joints to ``friction`` (n, 4) and ``pairs``, in place."""
     for h in hidden:
         if h.effect == "coupling_friction":
@@ -219,6 +214,6 @@ def _add_coupling_friction(
             pairs.append((h.joint, h.other, viscous, h["coulomb"]))
 
 
-def _symmetric(upper: NDArray[np.float64]) -> NDArray[np.float64]:
-    out: NDArray[np.float64] = np.triu(upper) + np.triu(upper, 1).T
+def _symmetric(upper: Array) -> Array:
+    out: Array = np.triu(upper) + np.triu(upper, 1).T
     return out

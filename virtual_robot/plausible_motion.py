@@ -18,10 +18,7 @@ SAMPLES = 2000
 
 
 def plausible_trajectory(robot: RobotConfig, seed: int = 0) -> Trajectory:
-    """Draw a periodic motion that uses the limits of the joints; begins and ends at rest.
-
-    It is not optimised for identification (``armident trajectory`` does that), and collisions are not checked.
-    """
+    """Draw a periodic motion that uses the limits of the joints; begins and ends at rest."""
     rng, n = np.random.default_rng([seed, 4]), robot.n
     order = np.arange(1.0, HARMONICS + 1)
     sine, cosine = rng.normal(size=(2, HARMONICS, n)) / order[:, None]

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armident.configs import RobotConfig, SessionConfig
 from armident.configs.units import counts_per_si
@@ -70,10 +69,7 @@ class ServerReport:
 
 
 class Server:
-    """All virtual drives of a session on its buses (``with`` block), with the names of oddities by joint.
-
-    Raises ConfigError if a bus is missing or an EDS is unusable.
-    """
+    """All virtual drives of a session on its buses (``with`` block), with the names of oddities by joint."""
 
     def __init__(
         self,
@@ -93,7 +89,7 @@ class Server:
             drive = Drive(node.node_id, node.eds, j, robot.joints[j], motion, *callbacks, fd)
             drive.become_odd(make_oddities((oddities or {}).get(node.joint, ()), drive, session))
             self.drives.append(drive)
-        self._limit = _following_limit(robot)
+        self._limit = FOLLOWING_ERROR_LIMIT * np.abs(np.diag(robot.transmission_matrix)) * counts_per_si(robot)
         self._histogram = np.zeros(DELAY_BINS + 1, np.int64)
         self._latest = 0.0
         self._backlog = self._syncs = 0
@@ -142,10 +138,7 @@ class Server:
             drive_bus.close()
 
     def run(self, stopped: Callable[[], bool], duration: float | None = None) -> ServerReport:
-        """Answer every SYNC until ``stopped`` or ``duration``, s; raises BusDown if the only bus goes down.
-
-        Of several buses the others go on, and a bus that is back is served again.
-        """
+        """Answer every SYNC until ``stopped`` or ``duration``, s; raises BusDown if the only bus goes down."""
         begin, cpu = time.monotonic(), time.process_time()
 
         def over() -> bool:
@@ -255,7 +248,3 @@ class Server:
         cpu_share = self._cpu / self._seconds if self._seconds else 0.0
         dropped = sum(drive_bus.bus.dropped for drive_bus in self._buses)
         return ServerReport(self._syncs, p50, p99, self._latest, self._backlog, self._seconds, cpu_share, dropped)
-
-
-def _following_limit(robot: RobotConfig) -> NDArray[np.float64]:
-    return FOLLOWING_ERROR_LIMIT * np.abs(np.diag(robot.transmission_matrix)) * counts_per_si(robot)

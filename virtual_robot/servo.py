@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.robot import Controller
@@ -37,8 +37,8 @@ class Servo:
     """
 
     period: float
-    kp: NDArray[np.float64]
-    kv: NDArray[np.float64]
+    kp: Array
+    kv: Array
     velocity_feedback: bool
     velocity_samples: int
     filter_hz: float
@@ -111,7 +111,7 @@ def control_period(robot: RobotConfig, sync_period: float | None = None) -> floa
 
 def tuned_drives(
     robot: RobotConfig,
-    mass: NDArray[np.float64],
+    mass: Array,
     velocity_feedback: bool | None = None,
     *,
     period: float | None = None,
@@ -132,9 +132,7 @@ def tuned_drives(
     return Servo(period, np.array(known.kp), np.array(known.kv), True, known.velocity_samples, math.inf)
 
 
-def cascade_gains(
-    robot: RobotConfig, mass: NDArray[np.float64], bandwidth_hz: Sequence[float] = BANDWIDTH_HZ
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def cascade_gains(robot: RobotConfig, mass: Array, bandwidth_hz: Sequence[float] = BANDWIDTH_HZ) -> tuple[Array, Array]:
     """Gains ``kp`` (1/s) and ``kv`` (A s/rad), (n,) each, motor side, for two equal poles at the given bandwidths.
 
     ``mass`` (n, n): at the posture of tuning, joint side, with rotors. The last bandwidth counts for further joints.

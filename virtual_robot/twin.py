@@ -96,10 +96,7 @@ def at_period(session: SessionConfig, period_us: int) -> SessionConfig:
 
 
 def on_virtual_bus(session: SessionConfig, channel: str, cell: str) -> SessionConfig:
-    """Session on one vcan bus, without the cell's Zenoh, metrics and triggers: real drives and services stay apart.
-
-    Raises ConfigError if drives of several buses share a node id.
-    """
+    """Session on one vcan bus, without the cell's Zenoh, metrics and triggers: real drives and services stay apart."""
     nodes = [drive.node_id for drive in session.drives]
     if len(set(nodes)) < len(nodes):
         raise ConfigError(
@@ -173,7 +170,8 @@ def _with_drives(robot: RobotConfig, parameters: ArmParameters) -> tuple[RobotCo
         robot = robot.model_copy(update={"friction": friction})
         entries = [f"{joint.name} {g:g}" for joint, g in zip(robot.joints, smoothing, strict=True)]
         assumed["friction.sign_smoothing"] = entries if parameters.sign_smoothing is None else []
-    needed = needed_torque(robot, parameters.standard) if _lacks_torque(robot) else np.zeros(robot.n)
+    lacks_torque = any("torque" in joint.limits.missing() for joint in robot.joints)
+    needed = needed_torque(robot, parameters.standard) if lacks_torque else np.zeros(robot.n)
     ratio = np.abs(np.diag(robot.transmission_matrix))
     joints = []
     for j, joint in enumerate(robot.joints):
@@ -200,10 +198,6 @@ def _with_drives(robot: RobotConfig, parameters: ArmParameters) -> tuple[RobotCo
             assumed.setdefault("drive.saturation", []).append(f"{joint.name} {values['saturation']:g}")
         joints.append(joint.model_copy(update={"limits": limits, "drive": drive.model_copy(update=values)}))
     return robot.model_copy(update={"joints": tuple(joints)}), (*remarks, *_sentences(assumed))
-
-
-def _lacks_torque(robot: RobotConfig) -> bool:
-    return any("torque" in joint.limits.missing() for joint in robot.joints)
 
 
 def _three_digits(value: float) -> float:
@@ -235,10 +229,7 @@ def _session_for(path: Path, robot: RobotConfig) -> SessionConfig:
 
 
 def write_twin(twin: Twin, folder: Path) -> Path:
-    """Write ``robot.yaml``, ``cell.yaml`` and, without set points, ``trajectory.yaml`` for ``armident capture``.
-
-    Returns the session file; raises ConfigError if the files cannot be written.
-    """
+    """Write ``robot.yaml``, ``cell.yaml`` and, without set points, ``trajectory.yaml`` for ``armident capture``."""
     try:
         return _write_files(twin, folder)
     except OSError as error:
@@ -257,7 +248,8 @@ def _write_files(twin: Twin, folder: Path) -> Path:
         file = folder / "trajectory.yaml"
         remark = "Within the limits of the joints; collisions are not checked: for a virtual arm only."
         _write(file, twin.trajectory.model_dump(mode="json", by_alias=True, exclude_none=True), [remark])
-        session["setpoints"] = {"rpdo": 1, "every": _setpoint_interval(twin.session), "trajectory": file.name}
+        every = 1 if twin.session.sync.counter % 5 else 5
+        session["setpoints"] = {"rpdo": 1, "every": every, "trajectory": file.name}
     path = folder / "cell.yaml"
     _write(path, session, [f"Session of the virtual arm of {twin.robot.name}."])
     return path
@@ -274,11 +266,6 @@ def _robot_content(twin: Twin) -> dict[str, Any]:
     own = {"urdf": {**source["urdf"], "file": str(file)}, "joints": joints}
     gravity = {"gravity": source["gravity"]} if "gravity" in source else {}
     return {key: value for key, value in content.items() if key not in ("joints", "gravity")} | own | gravity
-
-
-def _setpoint_interval(session: SessionConfig) -> int:
-    """Number of SYNCs between two set points: 5, or 1 where 5 does not divide the SYNC counter."""
-    return 1 if session.sync.counter % 5 else 5
 
 
 def _write(path: Path, content: dict[str, Any], comments: Sequence[str]) -> None:

@@ -3,9 +3,9 @@
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
+from armident.arrays import Array
 from armident.configs.blanks import check_filled, needed
 from armident.configs.errors import ConfigError
 from armident.configs.schema.base import FrozenModel, WithBlanks
@@ -359,7 +359,7 @@ class RobotConfig(WithBlanks):
         return made
 
     @property
-    def sign_smoothing(self) -> NDArray[np.float64]:
+    def sign_smoothing(self) -> Array:
         """``g`` (n,) of the smoothed sign of each joint, s/rad or s/m; nominal values where the configuration has none.
 
         A coupling of two joints has the smaller of their two values.
@@ -370,7 +370,7 @@ class RobotConfig(WithBlanks):
         return np.broadcast_to(np.asarray(given, dtype=np.float64), (self.n,)).copy()
 
     @property
-    def transmission_matrix(self) -> NDArray[np.float64]:
+    def transmission_matrix(self) -> Array:
         """Matrix ``R`` of shape (n, n): ``q_motor = R q`` and ``tau = R' tau_motor`` (thesis equation 2.14)."""
         if self.transmission is None:
             return np.eye(self.n)

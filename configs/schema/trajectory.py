@@ -3,9 +3,9 @@
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from armident.arrays import Array
 from armident.configs.errors import ConfigError
 from armident.configs.schema.base import FrozenModel
 from armident.configs.schema.robot import RobotConfig
@@ -76,7 +76,7 @@ class Fourier(FrozenModel):
                 raise ValueError(f"fourier: the sum of {power} {name}_l is not zero: it would not begin at rest")
         return self
 
-    def sample(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    def sample(self, t: Array) -> Array:
         """Displacement from the start.
 
         Parameters
@@ -90,7 +90,7 @@ class Fourier(FrozenModel):
             Displacement, rad or m, shape (N, n).
         """
         angle = 2 * np.pi * self.frequency * t[:, None] * np.arange(1.0, len(self.sine) + 1)
-        away: NDArray[np.float64] = np.sin(angle) @ np.array(self.sine) + (np.cos(angle) - 1.0) @ np.array(self.cosine)
+        away: Array = np.sin(angle) @ np.array(self.sine) + (np.cos(angle) - 1.0) @ np.array(self.cosine)
         return away
 
 
@@ -134,7 +134,7 @@ class Trajectory(FrozenModel):
             return self.fourier.periods / self.fourier.frequency
         return sum(move.duration + move.dwell for move in self.moves)
 
-    def sample(self, period: float) -> NDArray[np.float64]:
+    def sample(self, period: float) -> Array:
         """Positions at ``0, period, 2 period, ...`` up to the end.
 
         Parameters
@@ -147,7 +147,7 @@ class Trajectory(FrozenModel):
         ndarray
             Positions, rad or m, shape (N, n).
         """
-        t: NDArray[np.float64] = np.arange(round(self.duration / period) + 1, dtype=np.float64) * period
+        t: Array = np.arange(round(self.duration / period) + 1, dtype=np.float64) * period
         if self.fourier is not None:
             return np.array(self.start) + self.fourier.sample(t)
         q = np.empty((t.size, len(self.start)))
@@ -180,7 +180,7 @@ class Trajectory(FrozenModel):
         check_motion(self.sample(period), period, robot, where)
 
 
-def check_motion(q: NDArray[np.float64], period: float, robot: RobotConfig, where: str) -> None:
+def check_motion(q: Array, period: float, robot: RobotConfig, where: str) -> None:
     """Refuse sampled positions that exceed the limits of a robot.
 
     Parameters
@@ -221,12 +221,12 @@ def check_motion(q: NDArray[np.float64], period: float, robot: RobotConfig, wher
                 raise ConfigError(f"{where}: {joint.name} reaches {label} {peak:.3f}, allowed is {limit:.3f}")
 
 
-def _smooth_step(s: NDArray[np.float64], a: float) -> NDArray[np.float64]:
+def _smooth_step(s: Array, a: float) -> Array:
     """Step from 0 to 1 for ``s`` in [0, 1]; the ramps of its trapezoidal velocity are half cosines of length ``a``."""
     v = 1.0 / (1.0 - a)
     s = np.clip(s, 0.0, 1.0)
     rising = v * (s / 2 - a / (2 * np.pi) * np.sin(np.pi * s / a))
     falling = 1.0 - v * ((1 - s) / 2 - a / (2 * np.pi) * np.sin(np.pi * (1 - s) / a))
     level = v * (s - a / 2)
-    step: NDArray[np.float64] = np.where(s < a, rising, np.where(s > 1 - a, falling, level))
+    step: Array = np.where(s < a, rising, np.where(s > 1 - a, falling, level))
     return step

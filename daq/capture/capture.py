@@ -59,11 +59,7 @@ def capture(
     save: threading.Event | None = None,
     reload: threading.Event | None = None,
 ) -> CaptureResult:
-    """Run one capture from the first SDO to the finished file; set ``stop`` to end it.
-
-    ``save`` writes the last seconds, in a capture with triggers; ``reload`` reads the configuration again. Raises
-    ConfigError if the capture could not start; then no file is left behind.
-    """
+    """Run one capture from the first SDO to the finished file; set ``stop`` to end it."""
     session, robot = plan.session, plan.robot
     now = next_time(plan.directory, robot.name, datetime.datetime.now(datetime.UTC))
     name = f"{robot.name}-{capture_stamp(now)}"

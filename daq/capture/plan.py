@@ -69,11 +69,7 @@ def load_plan(
     listen_only: bool,
     sniff_s: float | None = None,
 ) -> CapturePlan:
-    """Return the checked plan of a capture; ConfigError if the trajectory exceeds limits, or a bus is overloaded.
-
-    ``out``: default is the session's directory. ``duration``: s. ``sniff_s``: with ``listen_only``, time to discover
-    the TPDOs of the drives, s.
-    """
+    """Return the checked plan of a capture; ConfigError if the trajectory exceeds limits, or a bus is overloaded."""
     session = load_session(config, "capture")
     robot = load_robot(session.robot, "capture")
     check_fits(session, str(config))

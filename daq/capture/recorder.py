@@ -367,11 +367,7 @@ class Recorder:
         log.info("no standstill detected after the quick stop; the drives are disabled anyway")
 
     def _await_answers(self) -> None:
-        """Record until no answer is outstanding, or none has come for ``LATE_S``.
-
-        If all drives lag, the host is too busy: the limit is ``STARVED_S`` then, unless a heartbeat is missing or no
-        bus works. With another master, which continues to send SYNC, it is ``LATE_S`` in total.
-        """
+        """Record until no answer is outstanding, or none has come for ``LATE_S``."""
         reported = False
         begin = time.monotonic()
         last_s, lost = time.monotonic(), self._events.counts["heartbeat_lost"]

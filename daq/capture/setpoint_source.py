@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig, SessionConfig, Trajectory
 from armident.configs.schema.trajectory import RAMP_SHARE, Move
 from armident.configs.units import counts_per_si
@@ -41,7 +42,7 @@ class StandstillDetector:
         limits = np.array([joint.limits.velocity for joint in robot.joints])
         self._slow = limits * SLOW_SHARE * session.sync_period
         self._noise = np.abs(self._per_count).sum(axis=1) * NOISE_COUNTS
-        self._last: tuple[int, NDArray[np.float64]] | None = None
+        self._last: tuple[int, Array] | None = None
         self._since = 0
 
     def update(self, sync: int, counts: NDArray[np.integer]) -> bool:
@@ -82,7 +83,7 @@ def plan_setpoints(
     options = session.setpoints
     period = session.sync_period * options.every
     scale = counts_per_si(robot)
-    actual: NDArray[np.float64] = np.linalg.solve(robot.transmission_matrix, actual_counts / scale).astype(np.float64)
+    actual: Array = np.linalg.solve(robot.transmission_matrix, actual_counts / scale).astype(np.float64)
     start = np.array(trajectory.start)
     rest = np.repeat(start[None, :], int(np.ceil(options.settle_s / period)) + 1, axis=0)
     parts = [rest]
@@ -97,9 +98,7 @@ def plan_setpoints(
     return SetpointSchedule(SetpointPlan(counts, cob_ids, options.every, bus_numbers(session, robot)), first, last)
 
 
-def approach(
-    actual: NDArray[np.float64], start: NDArray[np.float64], robot: RobotConfig, period: float
-) -> NDArray[np.float64]:
+def approach(actual: Array, start: Array, robot: RobotConfig, period: float) -> Array:
     """Return positions (N, n), rad or m, of a smooth move within `APPROACH_SHARE` of the limits; ``period`` in s."""
     distance = np.abs(start - actual)
     velocity = np.array([joint.limits.velocity for joint in robot.joints]) * APPROACH_SHARE

@@ -39,10 +39,7 @@ log = logging.getLogger(__name__)
 
 
 def stop_frames(session: SessionConfig, robot: RobotConfig) -> list[Frames]:
-    """Return the frames of a quick stop (CiA 402 part 2, controlword 02h) of every drive, for each bus of a session.
-
-    RPDOs of the controlwords come first, since they act at once; SDO requests follow for drives that map none.
-    """
+    """Return the frames of a quick stop (CiA 402 part 2, controlword 02h) of every drive, for each bus of a session."""
     assert session.setpoints is not None
     word = int(Control.QUICK_STOP).to_bytes(2, "little")
     request = bytes([_SDO_WRITE_TWO_BYTES]) + CONTROLWORD.to_bytes(2, "little") + b"\0" + word + b"\0\0"
@@ -123,11 +120,7 @@ class Guard:
 
 
 def guard(config: str, following_s: float = FOLLOWING_S) -> None:
-    """Run ``armident guard`` until a signal or an alarm; ``following_s``: time of motion at the velocity limit, s.
-
-    An alarm, SIGINT and SIGTERM stop the drives; an alarm raises ArmidentError with its reason. SIGUSR1 ends the guard
-    after the motion, without a quick stop.
-    """
+    """Run ``armident guard`` until a signal or an alarm; ``following_s``: time of motion at the velocity limit, s."""
     session = load_session(config)
     robot = load_robot(session.robot)
     try:

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 
 FOLLOWING_S = 0.1
@@ -23,18 +23,16 @@ HEARTBEATS_MISSED = 3
 HEARTBEAT_MARGIN_S = 0.1
 """A heartbeat or SYNC is lost after this number of heartbeat periods plus a margin for the delay of the host, s."""
 
-Floats = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class MotionLimits:
     """Limits of the joints, (n,), SI units; ``following``: largest distance between demand and position."""
 
-    low: Floats
-    high: Floats
-    velocity: Floats
-    torque: Floats
-    following: Floats
+    low: Array
+    high: Array
+    velocity: Array
+    torque: Array
+    following: Array
 
 
 def motion_limits_of(robot: RobotConfig, following_s: float = FOLLOWING_S) -> MotionLimits:

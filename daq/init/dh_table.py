@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import ConfigError, Mdh
 from armident.configs.expression import evaluate
 from armident.configs.mdh import modified_dh
@@ -29,8 +29,6 @@ _GREEK = {"\u03b8": "theta", "\u03b1": "alpha", "\u03c0": "pi", "\u00b0": "", "\
 _UNIT = re.compile(r"^(.*?)\s*[\[(]\s*(\w*)\s*[\])]$")
 _SCALES = {"": 1.0, "rad": 1.0, "m": 1.0, "deg": math.pi / 180, "mm": 1e-3}
 _TYPES = {"revolute": "revolute", "r": "revolute", "prismatic": "prismatic", "p": "prismatic"}
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,7 @@ def of_classical(rows: Sequence[DhRow]) -> list[Mdh]:
     return list(modified_dh(np.array(axes), np.array(points), [row.name for row in rows]).parameters)
 
 
-def _turn(axis: int, angle: float) -> Floats:
+def _turn(axis: int, angle: float) -> Array:
     c, s = math.cos(angle), math.sin(angle)
     if min(abs(c), abs(s)) < 1e-15:
         c, s = float(round(c)), float(round(s))
@@ -88,7 +86,7 @@ def _turn(axis: int, angle: float) -> Floats:
     return frame
 
 
-def _shift(axis: int, length: float) -> Floats:
+def _shift(axis: int, length: float) -> Array:
     frame = np.eye(4)
     frame[axis, 3] = length
     return frame

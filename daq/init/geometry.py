@@ -54,11 +54,7 @@ def from_urdf(
     tip: str | None = None,
     fits: Callable[[RobotConfig], object] | None = None,
 ) -> Geometry:
-    """Geometry of a URDF, to which the robot configuration in ``out`` refers.
-
-    ``base``, ``tip``: ``None`` is the root, and the end of the only chain or of the one that ``fits``: it raises if a
-    robot is not the recorded one. A ConfigError lists the chains that remain.
-    """
+    """Geometry of a URDF, to which the robot configuration in ``out`` refers."""
     if not is_file(file):
         raise ConfigError(f"{file}: no such file")
     if file.suffix.lower() not in URDF_SUFFIXES:

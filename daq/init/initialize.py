@@ -66,7 +66,8 @@ def run_init(options: InitOptions) -> str:
     signal = _signal(robot)
     cell = CellFacts(**{"cell": f"{robot['name']}_cell", **options.cell})
     session = session_content(geometry.robot, signal, facts, cell)
-    head = f"# Written by armident init from {_sources(geometry, facts)}. {MARK} marks a value that is not known yet.\n"
+    sources = geometry.source if facts is None else f"{geometry.source} and {facts.path.name}"
+    head = f"# Written by armident init from {sources}. {MARK} marks a value that is not known yet.\n"
     options.out.mkdir(parents=True, exist_ok=True)
     robot_file.write_text(head + yaml_text(robot), encoding="utf-8")
     session_file.write_text(head + yaml_text(session), encoding="utf-8")
@@ -110,10 +111,6 @@ def _signal(robot: Mapping[str, Any]) -> str:
     first = robot["joints"][0]
     joint = first.value if isinstance(first, Noted) else first
     return str(joint["drive"]["signal"])
-
-
-def _sources(geometry: Geometry, facts: RecordedFacts | None) -> str:
-    return geometry.source if facts is None else f"{geometry.source} and {facts.path.name}"
 
 
 def summary(robot_file: Path, session_file: Path, geometry: Geometry, facts: RecordedFacts | None) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.clocks import UNITS, JitterError, in_seconds
 from armident.daq.interchange.import_options import FLAGS, given
@@ -28,8 +29,6 @@ LARGEST_SHARE = 0.999
 REST_SHARE = 0.01
 """Share of the widest range of motion up to which a joint is at rest, as in `armident.identify`."""
 
-Floats = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class RecordedFacts:
@@ -44,10 +43,10 @@ class RecordedFacts:
     duration_s: float
     signal: str
     has_demand: bool
-    position: Floats
-    velocity: Floats
-    acceleration: Floats
-    effort: Floats
+    position: Array
+    velocity: Array
+    acceleration: Array
+    effort: Array
     options: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -135,14 +134,14 @@ def _facts(path: Path, recording: Recording, robot: RobotConfig, options: Mappin
     )
 
 
-def _largest_derivatives(q: Floats, sync: NDArray[np.int64], rate_hz: float) -> tuple[Floats, Floats]:
+def _largest_derivatives(q: Array, sync: NDArray[np.int64], rate_hz: float) -> tuple[Array, Array]:
     """Largest velocity and acceleration (n,) by local cubics, in the pieces between gaps; zero if all are too short."""
     from scipy.signal import savgol_filter
 
     window = max(5, round(SMOOTHED_S * rate_hz) | 1)
     pieces = [piece for piece in np.split(q, np.flatnonzero(np.diff(sync) > 1) + 1) if len(piece) > window]
 
-    def largest(order: int) -> Floats:
+    def largest(order: int) -> Array:
         found = [np.zeros((1, q.shape[1]))]
         for piece in pieces:
             values = savgol_filter(piece, window, 3, deriv=order, delta=1.0 / rate_hz, axis=0, mode="interp")

@@ -33,11 +33,7 @@ def robot_content(
     gravity: tuple[float, float, float] | None = None,
     link_torques: bool = False,
 ) -> dict[str, Any]:
-    """Return the content of ``robot.yaml``; arguments that are ``None`` are taken from recording and geometry.
-
-    ``gravity``: m/s^2 in the frame of the base, upright if nothing states it. ``link_torques``: torque sensors behind
-    the gears, so that rotors are no part of the model.
-    """
+    """Return the content of ``robot.yaml``; arguments that are ``None`` are taken from recording and geometry."""
     robot = geometry.robot
     content = dict(geometry.content)
     if gravity is not None:

@@ -53,10 +53,7 @@ def captured_streams(session: SessionConfig, robot: RobotConfig) -> tuple[Captur
 
 
 def unknown_phase(session: SessionConfig) -> str | None:
-    """Return a message about streams that are not sent on every SYNC, if SYNC has no counter; ``None`` without any.
-
-    In a log, or with another master, drives send these streams by their own count then, which is unknown.
-    """
+    """Return a message about streams that are not sent on every SYNC, if SYNC has no counter; ``None`` without any."""
     slow = [name for name, stream in session.streams.items() if max(stream.every, stream.pack) > 1]
     if not slow:
         return None

@@ -222,10 +222,7 @@ class StreamLayout:
         t_ns: NDArray[np.int64],
         raw: Mapping[str, NDArray[Any]],
     ) -> None:
-        """Write the content of message records (N,) into arrays: SYNC numbers, times (ns UTC), raw values by field.
-
-        Raises DataError if a record does not have the layout of the stream's channel.
-        """
+        """Write the content of message records (N,) into arrays: SYNC numbers, times (ns UTC), raw values by field."""
         octets = np.frombuffer(rows, dtype=np.uint8)
         template, mask = self._pattern(len(rows))
         whole = octets.size // 8 * 8

@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig, SessionConfig
 
 Quantity = Literal["position", "velocity", "current", "voltage", "torque", "demand", "status"]
@@ -68,9 +69,9 @@ class Stream:
     fields: dict[str, Field]
     raw: dict[str, NDArray[Any]]
 
-    def si(self, name: str) -> NDArray[np.float64]:
+    def si(self, name: str) -> Array:
         """Return a field in SI units, shape (N, n), on the side that the field states."""
-        scaled: NDArray[np.float64] = self.raw[name].astype(np.float64) * np.asarray(self.fields[name].scale)
+        scaled: Array = self.raw[name].astype(np.float64) * np.asarray(self.fields[name].scale)
         return scaled
 
     def named(self, quantity: Quantity) -> str | None:

@@ -35,10 +35,7 @@ def located(path: Path | str) -> Path:
 
 @contextmanager
 def opened(path: Path) -> Iterator[BinaryIO]:
-    """Open a file or an object for reading; of an object only what is read is fetched.
-
-    An object that is replaced while it is read is refused. Raises ConfigError if it is missing or cannot be read.
-    """
+    """Open a file, or an object of which only what is read is fetched; ConfigError if missing or replaced."""
     if not isinstance(path, ObjectUrl):
         with path.open("rb") as file:
             yield file

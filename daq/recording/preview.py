@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.daq.recording.layout import StreamLayout
 from armident.daq.recording.model import Field
@@ -23,7 +24,7 @@ class PreviewChannel:
     """Preview of one stream every ``layout.every`` SYNCs; each field has its raw one and a matrix (n, n) to SI."""
 
     layout: StreamLayout
-    matrices: tuple[NDArray[np.float64], ...]
+    matrices: tuple[Array, ...]
     sources: tuple[str, ...]
 
     @classmethod
@@ -33,7 +34,7 @@ class PreviewChannel:
         """Return the preview of a stream, at most at ``rate_hz``; ``None`` if it has nothing but status words."""
         every = stream.every * max(1, -(-round(sample_rate_hz) // round(max(rate_hz, 1.0) * stream.every)))
         fields: list[Field] = []
-        matrices: list[NDArray[np.float64]] = []
+        matrices: list[Array] = []
         sources: list[str] = []
         for field in stream.fields:
             if field.quantity == "status":
@@ -66,7 +67,7 @@ class PreviewChannel:
 
     def select(
         self, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[str, NDArray[np.float64]]]:
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[str, Array]]:
         """Return SYNC numbers, times (M,), ns UTC, and SI values (M, n) of the preview, from raw (N, n) by field."""
         shown = np.flatnonzero((sync + 1) % self.layout.every == 0)
         values = {
@@ -76,7 +77,7 @@ class PreviewChannel:
         return sync[shown], t_ns[shown], values
 
 
-def _joint_torque(stream: StreamLayout, robot: RobotConfig) -> tuple[str, NDArray[np.float64]] | None:
+def _joint_torque(stream: StreamLayout, robot: RobotConfig) -> tuple[str, Array] | None:
     """Return the field of the drives' effort and its matrix (n, n) to joint torques; ``None`` without such a field.
 
     ``tau_joint = R' diag(gain) signal`` (thesis equation 2.14); ``None`` also if the stream has a torque.

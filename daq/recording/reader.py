@@ -5,6 +5,7 @@ import mmap
 import os
 from contextlib import suppress
 from dataclasses import dataclass, field
+from operator import itemgetter
 from pathlib import Path
 from typing import BinaryIO
 
@@ -115,10 +116,7 @@ def is_recording(path: Path) -> bool:
 
 
 def unpacked_bytes(path: Path) -> int:
-    """Return the bytes of a recording's records if its chunks were unpacked; a damaged chunk counts nothing.
-
-    The arrays of `read_recording` are smaller. Raises OSError if the file cannot be read.
-    """
+    """Return the bytes of a recording's records if its chunks were unpacked; a damaged chunk counts nothing."""
     with path.open("rb") as file:
         if path.stat().st_size == 0:
             return 0
@@ -241,7 +239,7 @@ def _recording(path: Path, content: _Content) -> Recording:
     first = {layout.name: k for k, layout in reversed(scan.layouts.items())}
     streams = {
         name: _stream(content.rows_of(k), scan.layouts[k], scan.rewritten)
-        for name, k in sorted(first.items(), key=_by_channel)
+        for name, k in sorted(first.items(), key=itemgetter(1))
     }
     if "samples" not in streams:
         raise DataError(f"{path}: no topic /samples")
@@ -271,10 +269,6 @@ def _recording(path: Path, content: _Content) -> Recording:
         metadata=scan.metadata.get(FACTS, {}),
         missing="; ".join(missing) or None,
     )
-
-
-def _by_channel(entry: tuple[str, int]) -> int:
-    return entry[1]
 
 
 def _stream(rows: GrowingRows, layout: StreamLayout, rewritten: bool) -> Stream:

@@ -111,11 +111,7 @@ def reason_to_stay(path: Path, identified: Collection[str] | None, copied_to: Pa
 
 
 def identified_in(directory: Path, robot: str) -> set[str] | None:
-    """Return the captures that workers have finished, or do not take; ``None`` if the folder has no ledger of workers.
-
-    A capture that is still written counts as one of them: it is identified when it ends, which may be never. Raises
-    OSError if the ledger cannot be read.
-    """
+    """Return the captures that need no worker any more; ``None`` if the folder has no ledger of workers."""
     ledger = directory / LEDGER
     if not ledger.is_file():
         return None

@@ -307,10 +307,7 @@ def expected_messages(data: memoryview) -> dict[int, int] | None:
 
 
 def summary_records(data: memoryview, begin: int = 0) -> Iterator[tuple[int, memoryview]] | None:
-    """Return opcode and content of the records of a valid summary, from the bytes of a file from ``begin`` to its end.
-
-    ``None`` if there is none, or it begins before. Raises MalformedRecord if the footer is none.
-    """
+    """Return opcode and content of the records of a valid summary, from byte ``begin`` on; ``None`` without one."""
     footer_start = len(data) - len(mcap.MAGIC) - mcap.FOOTER_SIZE
     footer_end = footer_start + mcap.FOOTER_SIZE
     if begin + footer_start < len(mcap.MAGIC) or footer_start < 0 or bytes(data[footer_end:]) != mcap.MAGIC:

@@ -154,10 +154,7 @@ class RecordingWriter:
     def append(
         self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> None:
-        """Add rows to a stream.
-
-        SYNC numbers (N,), their receive times (N,), ns UTC, and raw values (N, n) of every field.
-        """
+        """Add rows to a stream: SYNC numbers (N,), receive times (N,), ns UTC, and raw values (N, n) of every field."""
         if len(sync) == 0:
             return
         channel, layout = self._layouts[stream]
@@ -243,10 +240,7 @@ class RecordingWriter:
             self._event(topic, sync, self._last_ns, event)
 
     def close(self, counters: Mapping[str, int]) -> None:
-        """Write the rest, the counters of the capture and the summary; the file is complete afterwards.
-
-        Raises ConfigError if the end cannot be written; the file remains readable as a truncated one.
-        """
+        """Write the rest, the counters of the capture and the summary; the file is complete afterwards."""
         try:
             self.flush()
             # If the last rows could not be written, their gaps may still fit on the disk.

@@ -174,10 +174,7 @@ def end_content(
 
 
 def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str, Any]) -> Recording:
-    """Return the recording of a published capture from its events and its blocks, in any order, with duplicates.
-
-    ``missing`` describes the blocks that did not arrive. DataError if events and blocks do not belong together.
-    """
+    """Return the recording of a published capture from its events and its blocks, in any order, with duplicates."""
     if start.get("capture") != end.get("capture"):
         raise DataError("the start and the end are of different captures")
     try:

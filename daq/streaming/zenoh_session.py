@@ -92,11 +92,7 @@ def configuration(
 def open_session(
     session: SessionConfig, role: Role, *, any_port: bool = False, identity: certificates.Role | None = None
 ) -> zenoh.Session:
-    """Open a Zenoh session; capture and worker, one each per cell, start in any order; an observer only connects.
-
-    ``any_port``, ``identity``: as in `configuration`. ConfigError if another process of that role runs, or if a client
-    does not reach its router.
-    """
+    """Open a Zenoh session; capture and worker, one each per cell, start in any order; an observer only connects."""
     config = configuration(session, role, any_port=any_port, identity=identity)
     try:
         return zenoh.open(config)

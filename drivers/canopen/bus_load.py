@@ -173,10 +173,7 @@ class Option:
 
 
 def alternatives(session: SessionConfig) -> list[Option]:
-    """Changes that make a session fit, nearest first: fewest kinds of change, then smallest change.
-
-    Each combination of kinds (rate, buses, FD, packing) gives its smallest change, unless that only adds to another.
-    """
+    """Changes that make a session fit, nearest first: fewest kinds of change, then smallest change."""
     found = sorted(_all_options(session), key=lambda option: (option.kinds, option.size))
     chosen: list[Option] = []
     for option in found:

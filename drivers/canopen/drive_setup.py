@@ -77,11 +77,7 @@ def set_sync_counter(sdo: DriveSdo, overflow: int) -> str | None:
 
 
 def await_mode(drives: list[DriveSdo]) -> None:
-    """Wait until enabled drives report cyclic synchronous position mode (6061h).
-
-    Some report a mode only some time after they have been enabled, and none or -1 before. ConfigError if a drive
-    reports another mode for `MODE_TIMEOUT`.
-    """
+    """Wait until enabled drives report cyclic synchronous position mode (6061h), up to `MODE_TIMEOUT`."""
     until = time.monotonic() + MODE_TIMEOUT
     for sdo in drives:
         while (mode := sdo.read_optional(od.MODE_DISPLAY, 0, "b")) != od.CYCLIC_SYNCHRONOUS_POSITION:

@@ -94,10 +94,7 @@ class DriveMaster:
         return self._networks[self._session.bus_of(drive).channel]
 
     def configure(self) -> None:
-        """Check every drive against the robot, then map and enable the session's TPDOs; ConfigError if one refuses.
-
-        Late drives are waited for (``boot_timeout_s``). What is unusual but harmless becomes an event ``remark``.
-        """
+        """Check every drive against the robot, then map and enable the session's TPDOs; ConfigError if one refuses."""
         for sdo in self._drives:
             self._command(NmtCommand.PRE_OPERATIONAL, sdo)
         until = time.monotonic() + self._session.boot_timeout_s
@@ -129,11 +126,7 @@ class DriveMaster:
         await_mode(self._drives)
 
     def supervise(self) -> list[DriveEvent]:
-        """Events since the last call: EMCY, lost and returned heartbeats, NMT states, reboots, changed mappings.
-
-        Never waits. A bus that went down is reopened when it is back; until then its drives count as lost. Raises
-        BusDown if all buses are down.
-        """
+        """Return the events since the last call, without waiting: EMCY, heartbeats, NMT states, changed mappings."""
         alive = {channel: network.reopen() for channel, network in self._networks.items()}
         if not any(alive.values()):
             raise BusDown(f"bus {', '.join(alive)}: went down")

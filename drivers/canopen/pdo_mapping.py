@@ -70,10 +70,7 @@ def _disable_tpdo(sdo: DriveSdo, communication: int) -> None:
 
 
 def _map_stop(sdo: DriveSdo, rpdo: int) -> None:
-    """Map the controlword (6040h) into an event-driven RPDO, which stops a drive faster than SDO.
-
-    A drive without this RPDO, or that does not map the controlword, is stopped by SDO.
-    """
+    """Map the controlword (6040h) into an event-driven RPDO, which stops a drive faster than SDO."""
     communication, mapping = od.RPDO_COMMUNICATION + rpdo - 1, od.RPDO_MAPPING + rpdo - 1
     if communication not in sdo.node.object_dictionary or mapping not in sdo.node.object_dictionary:
         return
@@ -85,10 +82,7 @@ def _map_stop(sdo: DriveSdo, rpdo: int) -> None:
 
 
 def _map_pdo(sdo: DriveSdo, communication: int, mapping: int, cob: int, entries: tuple[int, ...], every: int) -> None:
-    """Configure a PDO in the order of CiA 301 (section 7.5.2.36), as far as it differs.
-
-    Bit 30 of the COB-ID (no RTR) stays as the drive has it: it does not concern PDOs that answer SYNC.
-    """
+    """Configure a PDO in the order of CiA 301 (section 7.5.2.36), as far as it differs."""
     before = sdo.read(communication, 1, "I")
     mapped = read_mapping(sdo, mapping)
     right = mapped == entries and not (before ^ cob) & ~od.NO_RTR

@@ -57,11 +57,7 @@ def launcher_command(command: Sequence[str], buses: int = 1) -> list[str]:
 
 
 def run_in_guest(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable: Sequence[Path] = ()) -> int:
-    """Run ``command`` in a guest, in the current directory, and return its exit status.
-
-    ``memory`` has the format of the kernel's ``mem=``; only used pages take memory of the host. ``writable``: more
-    folders that are writable. An ArmidentError has the end of the guest's kernel log.
-    """
+    """Run ``command`` in a guest, in the current directory, and return its exit status."""
     if not re.fullmatch(r"\d+[KMG]?", memory):
         raise ArmidentError(f"{memory!r}: expected the memory of a guest as a number with K, M or G, such as 4096M")
     reason = launcher_obstacle()

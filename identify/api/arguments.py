@@ -20,10 +20,7 @@ def recordings_of(recordings: Recorded | Sequence[Recorded]) -> tuple[Recording,
 
 
 def robot_of(robot: Robot | None, recordings: Sequence[Recording], command: str = "identify") -> RobotConfig:
-    """Return the configuration to use, with all values that a command needs.
-
-    ``robot``: configuration, or its path or shipped name; ``None``: the one inside the first recording.
-    """
+    """Return the configuration to use, with all values that a command needs."""
     if isinstance(robot, str | Path):
         return load_robot(robot, command)
     config = recordings[0].robot if robot is None else robot

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.api.arguments import Progress, Recorded, Robot, recordings_of, robot_of
@@ -23,8 +23,6 @@ from armident.identify.identification.options import ControllerName, Options
 from armident.identify.identification.robot_model import IN_MEMORY, RobotModel
 from armident.identify.identification.saved_model import model_of, used_configuration
 from armident.identify.signals.choices import DerivativesName
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, repr=False)

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.daq.recording import Recording
 from armident.identify.api.arguments import Progress, Recorded, Robot, recordings_of, robot_of
@@ -40,8 +40,6 @@ from armident.identify.setup.result import SetupCheck
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.differentiate import Derivatives
 from armident.identify.signals.experiments import Experiment
-
-Array = NDArray[np.float64]
 
 BEYOND = 0.1
 """Share of the identified range by which a motion may leave it without a warning (as for equal motions)."""

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig, Trajectory
 from armident.identify.api.arguments import Progress, Robot, robot_of
 from armident.identify.api.identification_api import Identification, identified
@@ -18,8 +17,6 @@ from armident.identify.documents.identification import IdentificationDocument
 if TYPE_CHECKING:
     from armident.identify.excitation.design import Design as DesignResult
     from armident.identify.excitation.safety import CheckedTrajectory, SafetyChecks
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, repr=False)

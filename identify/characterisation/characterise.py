@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig
 from armident.daq.recording import Recording
@@ -24,8 +23,6 @@ from armident.identify.documents.characterisation import (
 )
 from armident.identify.effects.terms import arm_model
 from armident.identify.identification.from_recording import experiments_of
-
-Array = NDArray[np.float64]
 
 NO_PLATEAU = (
     "not determined: {joint} never moves alone at a constant speed; record its motion `constant_speeds`, "

@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.regression.ar_noise import ArModel, fit_ar
 from armident.identify.regression.orders import MAX_AR_ORDER
-
-Array = NDArray[np.float64]
 
 RATE_HZ = 200.0
 """Rate of block means of the signals: friction of an arm under feedback acts below a fifth of it."""

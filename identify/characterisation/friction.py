@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.characterisation.estimates import RATE_HZ, SEEN, Fitted, averaged, fitted, solved
 from armident.identify.characterisation.motion import SLOWEST, Alone, Plateau
@@ -18,8 +19,6 @@ from armident.identify.effects.effect import Place
 from armident.identify.effects.friction import AsymmetricViscousFriction, StribeckBell
 from armident.identify.effects.terms import arm_model
 from armident.identify.robot.motion import Motion
-
-Array = NDArray[np.float64]
 
 SPEEDS = 2
 """Least number of different speeds in each direction: four torques for four parameters."""

@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.effects.free_shapes import hats
 from armident.identify.identification.equations import aligned_torque
 from armident.identify.signals.differentiate import differentiate
 from armident.identify.signals.experiments import Experiment
-
-Array = NDArray[np.float64]
 
 WINDOW_S = 0.05
 """Time over which a speed is averaged, s: a position known to 0.01 mrad gives it to 0.3 mrad/s."""
@@ -110,10 +109,7 @@ def alone(experiments: Sequence[Experiment], robot: RobotConfig, joint: int) -> 
 
 
 def plateaus(motions: Sequence[Alone]) -> list[tuple[Plateau, ...]]:
-    """Return the stretches of constant speed: pairs at one speed, forth and back over the same positions, and others.
-
-    The slowest first.
-    """
+    """Return the stretches of constant speed, slowest first: pairs at one speed over the same positions, and others."""
     found: list[tuple[Plateau, ...]] = []
     for one in motions:
         width, v = _width(one.dt), one.speed

@@ -19,11 +19,7 @@ MOTIONS: tuple[MotionFamily, ...] = (ConstantSpeeds(), Reversals())
 def motion_of(
     family: MotionFamily, robot: RobotConfig, joint: int, recordings: Sequence[Recording], collision: CollisionModel
 ) -> tuple[str, Trajectory]:
-    """Return the largest allowed motion of a family at a joint, in words and as a trajectory.
-
-    It is at most 1.5 times as fast as the recordings, and uses a tenth of the limits without one (`reach_of`). Raises
-    DataError, with the limit, if none is allowed.
-    """
+    """Return the largest allowed motion of a family at a joint, in words and as a trajectory."""
     home, speeds, accelerations = home_of(robot), np.zeros(robot.n), np.zeros(robot.n)
     if recordings:
         experiments, _ = experiments_of(recordings, robot, name_files=True)

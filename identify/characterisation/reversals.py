@@ -4,13 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.characterisation.estimates import RATE_HZ, SEEN, averaged, fitted, solved
 from armident.identify.characterisation.motion import KNOTS, Alone
 from armident.identify.effects.friction import dahl
-
-Array = NDArray[np.float64]
 
 DISPLACEMENTS = (1e-5, 0.1)
 """Displacements to try over the joint's range of motion; the largest is that of a diagnosis."""

@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.characterisation.estimates import LEVEL, RATE_HZ
 from armident.identify.characterisation.friction import Levels
-
-Array = NDArray[np.float64]
 
 HIGHEST_HZ = RATE_HZ / 4
 """Highest frequency of a ripple at a plateau: block means keep 90 % of it, and none of its aliases."""

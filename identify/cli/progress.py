@@ -31,10 +31,7 @@ class _Compilation(event.Listener):
 
 @contextmanager
 def progress(what: str) -> Iterator[Report]:
-    """Report stages and the share done, 0 to 1, from two seconds on: a bar on a terminal, otherwise plain lines.
-
-    The first run on a machine also prints that it compiles kernels. ``what``: beginning of each line.
-    """
+    """Report stages and the share done, 0 to 1, from two seconds on: a bar on a terminal, otherwise plain lines."""
     begin = time.monotonic()
     with event.install_listener("numba:compile", _Compilation(what)), _stages(what, begin) as report:
         yield report

@@ -84,10 +84,7 @@ def diagnose_command(
 
 
 def predict_command(paths: Sequence[Path], model: Path, config: Path | None, out: Path | None, *, as_json: bool) -> int:
-    """Carry out ``armident predict``; exit code `FOUND` if the model explains a recording no better than none.
-
-    ``out``: folder of the results, of several recordings with a folder for each; ``None``: beside each recording.
-    """
+    """Carry out ``armident predict``; exit code `FOUND` if the model explains a recording no better than none."""
     from armident.daq.recording import read_recording
     from armident.identify.api.prediction_api import predict
     from armident.identify.cli.progress import progress, warn
@@ -141,11 +138,7 @@ def _prediction_folders(paths: Sequence[Path], out: Path | None) -> list[Path]:
 def compare_command(
     baseline: Path, now: Path, out: Path | None, false_alarms: float, *, common: bool, as_json: bool
 ) -> int:
-    """Carry out ``armident compare``; exit code `FOUND` if the parameters differ significantly.
-
-    ``out``: folder; ``None``: ``comparison`` beside the later one. ``false_alarms``: probability of ``changed`` without
-    a change. ``common``: compare only the parameters that both have.
-    """
+    """Carry out ``armident compare``; exit code `FOUND` if the parameters differ significantly."""
     from armident.identify.api.comparison_api import compare
     from armident.identify.cli.progress import warn
     from armident.identify.monitoring.change.comparison import comparison_table

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.cli.print_table import print_table
 from armident.identify.documents.diagnosis import DiagnosisDocument
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from armident.identify.documents.prediction import PredictionDocument, PredictionsDocument
 
 
-def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDArray[np.float64]) -> None:
+def design_table(robot: RobotConfig, theta: Array | None, std: Array) -> None:
     """Print base parameters (b,), if known, and their predicted standard deviations (b,)."""
     table = Table(title=f"{robot.name}: predicted precision, base parameters", title_justify="left")
     names = arm_model(robot).base.names

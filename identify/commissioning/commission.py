@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.configs import ConfigError, DataError, MotionStopped, RobotConfig, Trajectory, load_robot
 from armident.daq.recording import Recording
 from armident.identify.api.identification_api import Identification, identify, load_identification
@@ -25,7 +26,6 @@ from armident.identify.investigation.choice import excitation_of, excluded, home
 from armident.identify.investigation.folder import Ask, Progress, answer_of, keep_motion, read_again
 from armident.identify.investigation.motions import FASTER, FIRST_CONTACT, MARGIN, Reach, reach_of
 from armident.identify.report.robot_file import robot_yaml
-from armident.identify.robot.chain import Floats
 from armident.identify.setup.result import SetupFinding
 from armident.identify.signals.experiments import Experiment
 
@@ -136,12 +136,12 @@ class CommissioningRun:
         motions = " ".join(str(one.recording.path) for one in self.document.motions[-2:] if one.recording.path)
         return Ended("not_trusted", sentence, f"{step}; or: armident investigate {motions}")
 
-    def _theta(self) -> Floats:
+    def _theta(self) -> Array:
         """Return the model of the motions of all joints so far, else of the small ones."""
         so_far = self.recordings[: self._played]
         return model_so_far(self.robot, self._experiments(so_far[self.robot.n :] or so_far), self.safety.theta)
 
-    def _excite(self, theta: Floats, share: float, duration: float, seed: int) -> Recording:
+    def _excite(self, theta: Array, share: float, duration: float, seed: int) -> Recording:
         """Move all joints at a share of their limits, as far as a model of the motions so far allows it."""
         reach, collision = self._reach(share), self.safety.collision
         choice, trajectory = excitation_of(self.robot, reach, theta, collision, duration, seed)
@@ -199,10 +199,7 @@ def _wrong(finding: SetupFinding) -> Ended:
 
 
 def started(robot: RobotConfig, source: str | Path | None, folder: Path | None) -> CommissioningRun:
-    """Return a new commissioning; ``source``: path or name of the configuration, whose URDF has masses and shapes.
-
-    Raises ConfigError if the folder has one already.
-    """
+    """Return a new commissioning; ``source``: path or name of the configuration, whose URDF has masses and shapes."""
     if folder is not None:
         if (folder / FILE).exists():
             raise ConfigError(f"{folder}: has a commissioning already; go on with --continue, or give another --out")
@@ -212,10 +209,7 @@ def started(robot: RobotConfig, source: str | Path | None, folder: Path | None) 
 
 
 def resumed(folder: Path) -> CommissioningRun:
-    """Return the commissioning of a folder; a stage that did not pass is judged again by the present configuration.
-
-    Raises ConfigError if there is none, DataError if a recording changed.
-    """
+    """Return the commissioning of a folder; a stage that did not pass is judged again by the present configuration."""
     document = load_document(folder / FILE, CommissioningDocument)
     robot = load_robot(folder / ROBOT, "trajectory")
     recordings = [read_again(one.recording) for one in document.motions]

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.design import PERIOD, design_trajectory
@@ -13,7 +14,6 @@ from armident.identify.identification.equations import equations, least_rows
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import smoothed_derivatives
 from armident.identify.identification.solvers import decimation_of
-from armident.identify.robot.chain import Floats
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.experiments import Experiment
 
@@ -23,7 +23,7 @@ PASSES = 2
 """Estimates, the first with an assumed noise, the others with that of the residuals."""
 
 
-def model_so_far(robot: RobotConfig, experiments: Sequence[Experiment], known: Floats | None) -> Floats:
+def model_so_far(robot: RobotConfig, experiments: Sequence[Experiment], known: Array | None) -> Array:
     """Return base parameters (b,), SI: the most probable ones where nothing but the limits is known of the arm.
 
     ``experiments``: corrected, SI, joint side. Each parameter has a Gaussian prior about its ``known`` value, (p,) or

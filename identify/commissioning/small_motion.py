@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.investigation.motions import MotionFamily, Path
-from armident.identify.robot.chain import Floats
 from armident.identify.setup.describe import effects_line, linear_map, order_finding, sign_finding
 from armident.identify.setup.result import SetupFinding
 from armident.identify.setup.signals import HELD_SHARE
@@ -48,11 +48,8 @@ class SmallMotion(MotionFamily):
             path.joint_to(joint, home - 0.5 * span, speed, 0.2)
 
 
-def wrong_answer(robot: RobotConfig, joint: int, asked: Floats, answer: Sequence[Experiment]) -> SetupFinding | None:
-    """Return the mistake that a small motion of one joint shows; ``None`` if its own signals answered.
-
-    ``asked`` (N,): positions of the joint, rad or m; ``answer``: recording, SI, joint side.
-    """
+def wrong_answer(robot: RobotConfig, joint: int, asked: Array, answer: Sequence[Experiment]) -> SetupFinding | None:
+    """Return the mistake that a small motion (N,) of one joint shows; ``None`` if its own signals answered."""
     names = [each.name for each in robot.joints]
     q, tau = (np.concatenate([getattr(e, signal) for e in answer]) for signal in ("q", "tau"))
     wanted, made = _farthest(asked[:, None])[0], _farthest(q)
@@ -80,13 +77,13 @@ def wrong_answer(robot: RobotConfig, joint: int, asked: Floats, answer: Sequence
     return sign_finding([names[joint]], signals)[0] if signals else None
 
 
-def _farthest(q: Floats) -> Floats:
+def _farthest(q: Array) -> Array:
     """Displacements (n,) of positions (N, n) where they are farthest from the first one, rad or m."""
     away = q - q[0]
     return np.asarray(away[np.abs(away).argmax(axis=0), np.arange(q.shape[1])])
 
 
-def _work(q: Floats, tau: Floats, dt: float) -> tuple[Floats, Floats]:
+def _work(q: Array, tau: Array, dt: float) -> tuple[Array, Array]:
     """Work of torques (N, n) along the motion of one joint (N,), and the sum of its amounts, J, (n,) each."""
     size = max(1, round(BLOCK_S / dt))
     rows = len(q) // size

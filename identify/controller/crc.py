@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.regression.ar_noise import ArModel, fit_ar
 from armident.identify.robot.controller import DiscreteController
@@ -39,8 +40,8 @@ class JointResponse:
     torque. ``prewhitening_order``: of the AR filter. ``fit_pct``: explained share of the held-out torque's variance.
     """
 
-    error_taps: NDArray[np.float64]
-    position_taps: NDArray[np.float64]
+    error_taps: Array
+    position_taps: Array
     prewhitening_order: int
     fit_pct: float
 
@@ -54,14 +55,14 @@ class IdentifiedController:
 
 
 def identify_crc(
-    q_motor: Sequence[NDArray[np.float64]],
-    reference_motor: Sequence[NDArray[np.float64]],
-    torque_motor: Sequence[NDArray[np.float64]],
+    q_motor: Sequence[Array],
+    reference_motor: Sequence[Array],
+    torque_motor: Sequence[Array],
     dt: float,
     *,
     length: int | Sequence[int] | None = None,
     velocity_loop: bool | None = None,
-    saturation: NDArray[np.float64] | None = None,
+    saturation: Array | None = None,
 ) -> IdentifiedController:
     """Impulse response of each motor's controller from tracking error to torque.
 
@@ -93,11 +94,7 @@ def identify_crc(
 
 
 def _identify_joint(
-    error: list[NDArray[np.float64]],
-    motion: list[NDArray[np.float64]],
-    nu: list[NDArray[np.float64]],
-    lengths: Sequence[int],
-    structures: Sequence[bool],
+    error: list[Array], motion: list[Array], nu: list[Array], lengths: Sequence[int], structures: Sequence[bool]
 ) -> JointResponse:
     longest = max(lengths)
     best: tuple[float, JointResponse] | None = None
@@ -130,20 +127,20 @@ def _identify_joint(
 class _Correlations:
     """``R_eps,eps`` (m, m) and ``R_nu,eps`` (m,) of 5.31 and 5.32, and the power of the output; all are sums."""
 
-    auto: NDArray[np.float64]
-    cross: NDArray[np.float64]
+    auto: Array
+    cross: Array
     power: float
 
     def __add__(self, other: "_Correlations") -> "_Correlations":
         return _Correlations(self.auto + other.auto, self.cross + other.cross, self.power + other.power)
 
-    def miss(self, taps: NDArray[np.float64], chosen: NDArray[np.int64]) -> float:
+    def miss(self, taps: Array, chosen: NDArray[np.int64]) -> float:
         """Sum of the squared errors of the impulse response ``taps`` (k,), whose tap numbers are ``chosen`` (k,)."""
         explained = 2 * taps @ self.cross[chosen] - taps @ self.auto[np.ix_(chosen, chosen)] @ taps
         return max(self.power - float(explained), 0.0)
 
 
-def _held_out(output: Sequence[NDArray[np.float64]], length: int) -> list[NDArray[np.float64]]:
+def _held_out(output: Sequence[Array], length: int) -> list[Array]:
     """Return the last part of every experiment, which is not used in the fit."""
     return [b[length - 1 + _cut(b.size - length + 1) :] for b in output]
 
@@ -153,7 +150,7 @@ def _cut(rows: int) -> int:
 
 
 def _correlations(
-    ar: ArModel, inputs: Sequence[Sequence[NDArray[np.float64]]], output: Sequence[NDArray[np.float64]], length: int
+    ar: ArModel, inputs: Sequence[Sequence[Array]], output: Sequence[Array], length: int
 ) -> tuple[_Correlations, _Correlations]:
     """Correlations of the prewhitened inputs at lags 0..length-1, of the fitted and of the held-out part."""
     parts: tuple[list[_Correlations], list[_Correlations]] = [], []
@@ -166,9 +163,7 @@ def _correlations(
     return sum(parts[0][1:], parts[0][0]), sum(parts[1][1:], parts[1][0])
 
 
-def _sums(
-    inputs: Sequence[NDArray[np.float64]], b: NDArray[np.float64], length: int, first: int, last: int
-) -> _Correlations:
+def _sums(inputs: Sequence[Array], b: Array, length: int, first: int, last: int) -> _Correlations:
     """Correlations over the samples ``first .. last - 1``, without a matrix of lagged inputs."""
     auto = np.empty((len(inputs) * length, len(inputs) * length))
     for i, u in enumerate(inputs):
@@ -180,9 +175,7 @@ def _sums(
     return _Correlations(auto, cross, float(b[first:last] @ b[first:last]))
 
 
-def _lag_products(
-    u: NDArray[np.float64], v: NDArray[np.float64], length: int, first: int, last: int
-) -> NDArray[np.float64]:
+def _lag_products(u: Array, v: Array, length: int, first: int, last: int) -> Array:
     """``sum_k u(k - i) v(k - j)`` for lags i, j, shape (length, length), by recursion along the diagonals."""
     out = np.empty((length, length))
     out[0], out[:, 0] = _products(u, v, length, first, last), _products(v, u, length, first, last)
@@ -193,9 +186,7 @@ def _lag_products(
     return out
 
 
-def _products(
-    u: NDArray[np.float64], v: NDArray[np.float64], length: int, first: int, last: int
-) -> NDArray[np.float64]:
+def _products(u: Array, v: Array, length: int, first: int, last: int) -> Array:
     """``sum_k u(k) v(k - lag)`` for every lag, shape (length,); summed piece by piece for the cache."""
     out = np.zeros(length)
     for begin in range(first, last, PIECE):
@@ -204,19 +195,17 @@ def _products(
     return out
 
 
-def _solve(correlations: _Correlations, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
+def _solve(correlations: _Correlations, chosen: NDArray[np.int64]) -> Array:
     """Solve the correlation equations; the response is zero along directions that the input does not excite."""
     gram, right = correlations.auto[np.ix_(chosen, chosen)], correlations.cross[chosen]
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     values, vectors = linalg.eigh(gram / np.outer(scale, scale))
     used = values > 1e-11 * values[-1]
-    taps: NDArray[np.float64] = vectors[:, used] @ ((vectors[:, used].T @ (right / scale)) / values[used]) / scale
+    taps: Array = vectors[:, used] @ ((vectors[:, used].T @ (right / scale)) / values[used]) / scale
     return taps
 
 
-def _assemble(
-    responses: Sequence[JointResponse], dt: float, saturation: NDArray[np.float64] | None
-) -> DiscreteController:
+def _assemble(responses: Sequence[JointResponse], dt: float, saturation: Array | None) -> DiscreteController:
     n = len(responses)
     error = np.zeros((n, max(r.error_taps.size for r in responses)))
     position = np.zeros((n, max(1, *(r.position_taps.size for r in responses))))

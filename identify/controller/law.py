@@ -12,11 +12,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.signals.recursive import recursive_filter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Controllers that are not identified: that of the configuration, and a stiff nominal PD that follows any motion."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
@@ -15,7 +15,7 @@ HIGHEST = 0.3
 """Largest natural frequency times sampling period (rad); above it the sampled loop is poorly damped."""
 
 
-def saturation(robot: RobotConfig) -> NDArray[np.float64]:
+def saturation(robot: RobotConfig) -> Array:
     """Largest motor torque of each drive (n,), N m or N; infinite where the configuration gives none."""
     return np.array(
         [np.inf if j.drive.saturation is None else abs(j.drive.gain) * j.drive.saturation for j in robot.joints]
@@ -38,9 +38,7 @@ def known_controller(robot: RobotConfig, dt: float) -> DiscreteController:
     )
 
 
-def nominal_controller(
-    model: ArmModel, theta: NDArray[np.float64], q: NDArray[np.float64], dt: float, bandwidth_hz: float
-) -> DiscreteController:
+def nominal_controller(model: ArmModel, theta: Array, q: Array, dt: float, bandwidth_hz: float) -> DiscreteController:
     """Critically damped PD for the mean inertia at each motor over the postures ``q`` (N, n).
 
     Its derivative acts on the error, not on the velocity, so that it follows a moving reference without lag.

@@ -7,9 +7,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.controller.crc import HELD_OUT, IdentifiedController, JointResponse
-from armident.identify.controller.law import UNITS, Array, Stretch, Structure, gains, loop_ratios, simulate_law, taps
+from armident.identify.controller.law import UNITS, Stretch, Structure, gains, loop_ratios, simulate_law, taps
 from armident.identify.controller.riv import NOISE_ORDER, LawFit, fit_law, refined_iv
 from armident.identify.robot.controller import DiscreteController
 

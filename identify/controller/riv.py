@@ -9,16 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.configs import DataError
-from armident.identify.controller.law import (
-    Array,
-    Stretch,
-    Structure,
-    columns,
-    integral_slopes,
-    pole_filter,
-    simulate_law,
-)
+from armident.identify.controller.law import Stretch, Structure, columns, integral_slopes, pole_filter, simulate_law
 from armident.identify.regression.ar_noise import WHITE, ArModel, fit_ar
 from armident.identify.signals.recursive import recursive_filter
 

@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.documents.identification import IdentificationDocument
-
-Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-9
 """Eigenvalues of the difference's correlation, relative to the largest, that count as rounding errors."""
@@ -76,11 +74,7 @@ def whitening(covariance: Array) -> Array:
 
 
 def difference_of(baseline: IdentificationDocument, now: IdentificationDocument) -> Difference:
-    """Difference of two identifications.
-
-    Raises DataError for different robots or models; Inconclusive if one is unusable, did not converge, or is far less
-    precise than the other.
-    """
+    """Difference of two identifications; DataError for other robots or models, Inconclusive if one tells too little."""
     for name, document in (("the baseline", baseline), ("the identification", now)):
         if not document.converged:
             raise Inconclusive(

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.baseline_comparison import Inconclusive
@@ -29,8 +29,6 @@ from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.residual_statistics import effect_columns
 from armident.identify.identification.sign_smoothing import with_numbers
 from armident.identify.regression.equations import applied, instants
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -55,10 +53,7 @@ class BaselineStage:
         return self.sought == ()
 
     def beside(self, structural: Sequence[Finding], joints: Sequence[str]) -> list[Finding]:
-        """Findings of changes, without those of joints at which something was left and has a structural name now.
-
-        The parameters there follow the effect that the model lacks.
-        """
+        """Findings of changes, without those of joints at which something was left and has a structural name now."""
         sought = {joints[j] for j in self.sought or ()}
         superseded = sought & {f.joint for f in structural if f.effect != UNNAMED}
         return [f for f in self.findings if f.joint not in superseded]
@@ -76,10 +71,7 @@ class BaselineStage:
 
 
 def against_baseline(stage: SetupStage, baseline: IdentificationDocument, criteria: Criteria) -> BaselineStage:
-    """Compare the recordings of a diagnosis with a baseline, and explain what has changed.
-
-    Raises DataError if the baseline is of another robot or model.
-    """
+    """Compare the recordings of a diagnosis with a baseline, and explain what has changed."""
     robot, experiments = _as_identified(stage.robot, baseline), [*stage.training, *stage.validation]
     # Of a document that is not stored; the test needs the length.
     samples = sum(e.q.shape[0] for e in experiments)
@@ -267,10 +259,7 @@ class _Described:
         return list(found.values())
 
     def _worse(self, after: Gap) -> set[int]:
-        """Joints of another motion than the baseline's with much larger residuals or errors after the changes.
-
-        Their functions of the motion are not compared.
-        """
+        """Joints of another motion than the baseline's with much larger residuals or errors after the changes."""
         if not self.test.residuals.reason:
             return set()
         before = {each.joint: each for each in self.baseline.residual_statistics or ()}

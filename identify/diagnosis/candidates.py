@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.diagnosis.stretch import MotionStretch
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.effect import Effect, Place
@@ -17,7 +17,6 @@ from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.whitening import joints_of, whitened
 from armident.identify.robot.motion import Motion
 
-Array = NDArray[np.float64]
 Key = tuple[str, int, int | None]
 """Name of an effect and its place."""
 Cached = tuple[str, int, int | None, Shapes, str, str]
@@ -149,10 +148,7 @@ class ColumnCache:
 
 
 def candidates(column_cache: ColumnCache) -> Iterator[Candidate]:
-    """All effects that the robot does not have at a place yet, and that this motion excites.
-
-    Without effects that only change parameters, and exchanges of signals.
-    """
+    """All effects with terms of their own that the robot does not have at a place yet, and that this motion excites."""
     study = column_cache.study
     motion = column_cache.motion(study.train[0], "measured")
     names = study.joints

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, ndtr
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.diagnosis.baseline_comparison import Difference, difference_of
 from armident.identify.diagnosis.changed_parameters import Attribution, Competition, ExplainedChange
@@ -23,8 +23,6 @@ from armident.identify.diagnosis.residual_test import (
 )
 from armident.identify.documents.identification import IdentificationDocument, Parameter
 from armident.identify.regression.multiple_testing import holm
-
-Array = NDArray[np.float64]
 
 FALSE_ALARMS = Criteria.change_rate
 """Probability of a false alarm per comparison."""
@@ -78,10 +76,7 @@ class ParameterChangeTest:
 
     @property
     def share(self) -> float:
-        """False-alarm rate of each test: all parameters together; single ones and groups; then those that were made.
-
-        They are the residuals and the changes of the catalogue.
-        """
+        """False-alarm rate of each test: all parameters together; single ones and groups; then those that were made."""
         return self.false_alarms / (2 + bool(self.residuals.tests) + (self.p_changes is not None))
 
     @property
@@ -169,10 +164,7 @@ def compare(
     robot: RobotConfig | None = None,
     criteria: Criteria | None = None,
 ) -> ParameterChangeTest:
-    """Test two identifications of an arm with the same model for a change of its parameters.
-
-    Changed parameters of a ``robot`` are explained. Raises DataError and Inconclusive as `difference_of`.
-    """
+    """Test two identifications of an arm with the same model for a change of its parameters."""
     criteria = criteria or Criteria()
     difference = difference_of(baseline, now)
     if "doubtful" in (baseline.verdict, now.verdict) and not same_motion(baseline, now):

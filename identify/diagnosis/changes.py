@@ -4,16 +4,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.effect import Effect, Place
 from armident.identify.effects.parameter_change import FrictionChange, ParameterChange
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import arm_model
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
+from armident.arrays import Array
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache
 from armident.identify.diagnosis.regression import IvFit
 from armident.identify.diagnosis.study import NOISE_ORDER, PERTURBATION
@@ -13,7 +13,6 @@ from armident.identify.effects.drive import Correction, motor_limit
 from armident.identify.regression.ar_noise import ar_models
 from armident.identify.regression.whitening import whitened, whitened_series
 
-Array = NDArray[np.float64]
 Look = tuple[float, float]
 """Largest value of a criterion, and the parameter there."""
 
@@ -60,10 +59,7 @@ def _at_simulated(
 
 
 def _likelihoods(fit: IvFit, effect: Correction, motor: int, limit: float, values: Sequence[float]) -> Array:
-    """Twice the log-likelihood (k,) of the torques corrected for each value, without a constant.
-
-    Parameters and the noise model of the motor's joint are estimated again: a strong correction changes its spectrum.
-    """
+    """Twice the log-likelihood (k,) of the torques corrected for each value, without a constant."""
     study, transmission = fit.study, fit.study.robot.transmission_matrix
     own = [s.torque @ np.linalg.inv(transmission)[:, motor] for s in study.train]
     size = PERTURBATION * float(np.concatenate(own).std())

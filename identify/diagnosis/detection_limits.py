@@ -1,9 +1,9 @@
 """Detection limits: smallest size of each effect that a diagnosis of these recordings would find."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from armident.arrays import Array
 from armident.identify.diagnosis.candidate_comparison import SelectionStep
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes, candidates
 from armident.identify.diagnosis.model_state import ModelState
@@ -12,8 +12,6 @@ from armident.identify.diagnosis.screening import orthogonal_directions
 from armident.identify.documents.diagnosis import DetectionLimit
 from armident.identify.effects.transmission import MotorOrder
 from armident.identify.effects.unnamed import NAME as UNNAMED
-
-Array = NDArray[np.float64]
 
 
 def detection_limits(state: ModelState, step: SelectionStep | None) -> list[DetectionLimit]:

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.diagnosis.baseline_stage import BaselineStage, against_baseline
 from armident.identify.diagnosis.candidate_comparison import Addition
@@ -48,7 +48,6 @@ from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.regression.equations import applied
 from armident.identify.signals.experiments import Experiment
 
-Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 

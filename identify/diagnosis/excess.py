@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri, fdtrc
 
+from armident.arrays import Array
 from armident.identify.signals.periodogram import hann_window, periodogram
-
-Array = NDArray[np.float64]
 
 LEAST_FREQUENCIES = 40
 """Fewest frequencies from which the level of the noise is estimated: its median is known within a quarter then."""
@@ -189,10 +188,7 @@ def about_reversals(moving: NDArray[np.bool_], qd: Array, slow: float) -> NDArra
 def bursts(
     series: Sequence[Array], times: Sequence[Array], velocities: Sequence[Array], slow: float = 0.0
 ) -> Excess | None:
-    """Moments with more power than the others, of the residual (M,) of one joint with its times and velocities (M,).
-
-    Times about rest, reversals and under the velocity ``slow``, where dry friction has no model, are left out.
-    """
+    """Moments with more power than the others, of the residual (M,) of one joint with its times and velocities (M,)."""
     powers, moments = [], []
     for e, t, qd in zip(series, times, velocities, strict=True):
         count = e.size // WINDOW

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armident.identify.diagnosis.candidate_comparison import Addition, SelectionStep
 from armident.identify.diagnosis.candidates import ColumnCache, Key
@@ -20,14 +19,9 @@ from armident.identify.effects.registry import catalogue, known, of_entry
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.effects.wiring import SignalMistake
 
-Array = NDArray[np.float64]
-
 
 def findings_of(final: ModelState, selected: Sequence[Selected], left: Sequence[Unexplained]) -> list[Finding]:
-    """Return the findings of a selection, in its order; `judged` gives them their probabilities.
-
-    ``selected``: effects of the selection. ``left``: dependences of the residual with them.
-    """
+    """Return the findings of a selection, in its order; `judged` gives them their probabilities."""
     deviations = standard_deviations(final)
     entries = list(final.robot.effects)
     values = final.with_values().effects
@@ -104,10 +98,7 @@ def _known_shares(left: Sequence[Unexplained]) -> dict[str, float]:
 
 
 def tempered_odds(step: SelectionStep, one: Addition) -> dict[Key, float]:
-    """Return the posterior odds of each other effect in place of one, whatever its law, with equal prior odds.
-
-    Differences of log-likelihood are reduced by the serial correlation that the noise models leave.
-    """
+    """Return the posterior odds of each other effect in place of one, whatever its law, with equal prior odds."""
     factor = float(np.clip(one.gain / one.raw_gain, 0.0, 1.0)) if one.raw_gain > 0.0 else 1.0
     odds: dict[Key, float] = {}
     for rival in step.rivals(one):
@@ -134,10 +125,7 @@ def negligible(
     immaterial: Sequence[Addition],
     dependences: Sequence[tuple[ResidualDependence, float]],
 ) -> list[Negligible]:
-    """Return what is significant and no cause: too small, or within the sampling convention of drives.
-
-    ``dependences``: of residuals, with the fall of the error without them, percent.
-    """
+    """Return what is significant and no cause: too small, or within the sampling convention of drives."""
     found: dict[Key, Negligible] = {}
     small = [*(one.addition for one in conventional), *immaterial]
     if step is not None:
@@ -193,10 +181,7 @@ def noise_floor(final: ModelState, left: Sequence[Unexplained]) -> Gap:
 
 
 def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
-    """Return the effects that this motion cannot show at some joint, with the reason.
-
-    ``hidden``: effects and places that the model contains or the motion does not excite.
-    """
+    """Return the effects that this motion cannot show at some joint, with the reason."""
     study = state.study
     motion = ColumnCache(study, state.fit.theta).motion(study.train[0], "measured")
     found: dict[tuple[str, str], NotVisible] = {}

@@ -4,14 +4,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.diagnosis.study import Study
 from armident.identify.diagnosis.variables import VARIABLES, Kind
 from armident.identify.effects.free_shapes import hats
 from armident.identify.robot.motion import Motion
-
-Array = NDArray[np.float64]
 
 SIDE = (0.0, 0.05, 0.15, 0.35, 0.65, 1.0)
 """Speeds of the knots of either direction, over the top speed: close at low speeds, where friction is curved."""

@@ -6,8 +6,8 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.diagnosis.regressor_cache import Arrays
 from armident.identify.diagnosis.stretch import KINDS, MotionStretch
 from armident.identify.diagnosis.study import Study
@@ -18,7 +18,6 @@ from armident.identify.regression.iv import JointEquations
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.differentiate import Derivatives
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 HELD_AT_ZERO = 1e-10

@@ -7,17 +7,15 @@ Otherwise they whiten the effect away: the weight of a spring, for example, is f
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
+from armident.arrays import Array
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.free_shapes import hats
 from armident.identify.regression.ar_noise import ArModel, ar_models, lagged_sums, levinson_durbin, lowest_aic
 from armident.identify.robot.motion import Motion
-
-Array = NDArray[np.float64]
 
 KNOTS = 7
 """Knots of each smooth function of the selection."""
@@ -93,10 +91,7 @@ def noise_beyond_shapes(fit: IvFit, column_cache: ColumnCache) -> list[ArModel]:
 
 
 def noise_sizes(fit: IvFit, column_cache: ColumnCache) -> Array:
-    """Size of the noise of each training stretch and joint beside that of all stretches, (S, n); 1 for few rows.
-
-    The rest that smooth functions of the motion leave is larger in one motion than in another, as all models err.
-    """
+    """Size of the noise of each training stretch and joint beside that of all stretches, (S, n); 1 for few rows."""
     parts, _ = _beyond_shapes(fit, column_cache)
     noise = ar_models(parts, MAX_AR_ORDER)
     rows = np.array([np.count_nonzero(s.moving, axis=0) for s in fit.study.train])

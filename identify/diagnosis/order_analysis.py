@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.diagnosis.candidates import Shapes
 from armident.identify.diagnosis.study import Study
-
-Array = NDArray[np.float64]
 
 OVERSAMPLING = 8
 """Bins per half period of the highest order; amplitudes there are attenuated by less than 1 %."""

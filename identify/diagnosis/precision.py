@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from armident.arrays import Array
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.model_state import ModelState
@@ -17,8 +17,6 @@ from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import Term
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.hac import newey_west, newey_west_matrix
-
-Array = NDArray[np.float64]
 
 NEWEY_WEST_LAGS = 20
 RANK = 1e-10
@@ -46,10 +44,7 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
 
 
 def p_value_of_effect(state: ModelState, entry: Entry) -> float:
-    """Probability of linear parameters of an effect so far from zero if it is not there (Wald's test).
-
-    Its own nonlinear parameters are fixed: without it, they mean nothing. A likelihood can rise without such evidence.
-    """
+    """Probability of linear parameters of an effect so far from zero if it is not there (Wald's test)."""
     number = list(state.robot.effects).index(entry)
     every, owners = _further_columns(state)
     slopes = [slope for slope, (owner, _) in zip(every, owners, strict=True) if owner != number]

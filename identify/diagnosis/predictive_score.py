@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from armident.arrays import Array
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, IvFit
 from armident.identify.effects.free_shapes import FreeShape
 from armident.identify.effects.terms import effect_terms
 from armident.identify.regression.ar_noise import ArModel, ar_models
 from armident.identify.regression.iv import JointEquations
 from armident.identify.regression.iv_regression import ties
-
-Array = NDArray[np.float64]
 
 BLOCKS = 10
 """Blocks of the training data: each much longer than the memory of the noise."""
@@ -106,10 +105,7 @@ class PredictiveScore:
 
     @property
     def _changes(self) -> Sequence[Array | None]:
-        """Parameters of each fold less the reference of a joint, (`FOLDS`, b); ``None`` without one.
-
-        The first model has no effects: the reference of theirs is zero.
-        """
+        """Parameters of each fold less the reference of a joint, (`FOLDS`, b); ``None`` without one."""
         study = self.fit.study
         rigid = self.fit.theta.size - study.model.e
         references = study.references or (None,) * study.robot.n
@@ -165,10 +161,7 @@ class PredictiveScore:
         return self.fit.study.volume
 
     def log_likelihoods_under(self, noise: Sequence[ArModel]) -> Array:
-        """Log-likelihood of the data of each joint under noise models, without constants of these data, (n,).
-
-        The noise of each stretch has a size of its own: models fit slow and fast motions differently well.
-        """
+        """Log-likelihood of the data of each joint under noise models, without constants of these data, (n,)."""
         each = self.volume[:, None] - 0.5 * np.log(self.innovations(noise))
         return np.asarray(np.sum(self.rows * each, axis=1))
 
@@ -193,10 +186,7 @@ class PredictiveScore:
         return np.array(found)
 
     def gain_over(self, other: "PredictiveScore", noise: Sequence[ArModel]) -> float:
-        """Gain of log-likelihood over a model without an effect, both under the same noise models.
-
-        These should be of a model in which nothing is missing. Others would take what is missing for noise.
-        """
+        """Gain of log-likelihood over a model without an effect, both under the same noise models."""
         ratio = np.log(other.innovations(noise) / self.innovations(noise))
         each = np.sum(self.rows * (0.5 * ratio + (self.volume - other.volume)[:, None]), axis=1)
         return float(np.sum(each / self.inflation_over(other, noise)))
@@ -264,10 +254,7 @@ def references_of(fit: IvFit) -> tuple[Array | None, ...]:
 
 
 def noise_of_motion(joint: JointEquations, rows: Array, theta: Array) -> Array:
-    """Torque (M, k) of k sets of rigid parameters at measured signals beyond that at simulated ones.
-
-    Simulated torques first follow the measured ones through a short filter, as simulated and real loop differ a little.
-    """
+    """Torque (M, k) of k sets of rigid parameters at measured signals beyond that at simulated ones."""
     if rows.shape[0] < LEAST_ROWS:
         return np.zeros((rows.shape[0], theta.shape[0]))
     x, z = (columns[columns < theta.shape[1]] for columns in (joint.x, joint.z))

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from armident.arrays import Array
 from armident.identify.diagnosis.excess import fisher
 from armident.identify.diagnosis.free_functions import FreeFunction
 from armident.identify.diagnosis.predictive_score import SUMS, block_edges, mean_square
-
-Array = NDArray[np.float64]
 
 UNPENALISED = 1e-9
 """Roughness, relative to the roughest direction, below which a direction counts as smooth altogether."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.diagnosis.model_equations import Equations
 from armident.identify.diagnosis.study import Study
@@ -15,8 +15,6 @@ from armident.identify.regression.equations import joint_variances, residuals, s
 from armident.identify.regression.iv_regression import IvRegression
 from armident.identify.regression.least_squares import Triangle, require_excitation
 from armident.identify.regression.whitening import whitened
-
-Array = NDArray[np.float64]
 
 MAX_AR_ORDER = 30
 """Highest order of noise models: three periods of the closed-loop bandwidth at the rate of the comparison. Akaike's
@@ -127,10 +125,7 @@ def fit_model(study: Study, theta0: Array | None = None, noise: Sequence[ArModel
 
 
 def safe(found: IvFit) -> IvFit:
-    """Return the fit, or one with noise models of lower order if its errors are much larger than with white weights.
-
-    Strongly coloured noise emphasises frequencies where simulated and measured motion differ: weak instruments.
-    """
+    """Return the fit, or one with noise models of lower order if its errors are much larger than with white weights."""
     white = found.renoised([ArModel(np.empty(0), ar.variance, 0.0) for ar in found.noise])
     most = found.study.criteria.weighted_errors * _rms(white)
     for order in (*LOWER_ORDERS, 0):

@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtr, fdtrc
 
+from armident.arrays import Array
 from armident.identify.documents.identification import IdentificationDocument, ResidualStatistics
 from armident.identify.regression.multiple_testing import holm
-
-Array = NDArray[np.float64]
 
 SAME_MOTION = 0.1
 """Largest difference of range and speed of a joint between both runs, as share of them. The model errors of a healthy
@@ -180,10 +178,7 @@ def _functions(old: ResidualStatistics, new: ResidualStatistics, part: slice, va
 def _whitened_functions(
     old: ResidualStatistics, new: ResidualStatistics, part: slice, variance: float
 ) -> tuple[Array, Array]:
-    """Whitened difference (r,) of the coefficients of some functions, and its change (r, k) per score of ``new``.
-
-    The noise of the baseline counts for both: a noise model of a changed arm would absorb a part of the change.
-    """
+    """Whitened difference (r,) of the coefficients of some functions, and its change (r, k) per score of ``new``."""
     information = [np.array(each.information)[part, part] for each in (old, new)]
     score = [np.array(each.score)[part] for each in (old, new)]
     scale = np.sqrt(np.maximum(np.diag(information[0]), 1e-300))

@@ -3,13 +3,11 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
+from armident.arrays import Array
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes
 from armident.identify.diagnosis.regression import IvFit
-
-Array = NDArray[np.float64]
 
 REFINEMENTS = 12
 """Evaluations of the golden-section search of a continuous shape between its neighbours on the grid."""
@@ -58,10 +56,7 @@ def score_statistic(fit: IvFit, columns: Sequence[tuple[int, Array]], sign: int 
 
 
 def contained(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> tuple[str, ...]:
-    """Linear parameters of a candidate whose torque the model can give without it, such as an inertia of two joints.
-
-    None if these are all: an effect keeps one parameter, which is then zero.
-    """
+    """Linear parameters of a candidate whose torque the model can give without it, such as an inertia of two joints."""
     columns = column_cache.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
     size = np.sqrt(np.sum([np.einsum("ij,ij->j", own, own) for _, own in columns], axis=0))
     size = np.where(size > 0.0, size, 1.0)

@@ -6,15 +6,12 @@ The simulated loop lacks the candidate: its columns are right at measured signal
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes
 from armident.identify.diagnosis.regression import IvFit
 from armident.identify.diagnosis.screening import orthogonal_directions, replaced
 from armident.identify.regression.whitening import whitened
-
-Array = NDArray[np.float64]
 
 FIRST_LOOKS = 6
 """Values over the range of a parameter before the refinement of the best one."""
@@ -25,20 +22,13 @@ REFINEMENTS = 8
 def shapes_of_both_signals(
     fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes
 ) -> tuple[Shapes, ...]:
-    """Nonlinear parameters by measured signals and by simulated ones, where these differ; either may be wrong.
-
-    Simulated signals are of a loop without the effect; measured ones contain noise that it amplifies.
-    """
+    """Nonlinear parameters by measured signals and by simulated ones, where these differ; either may be wrong."""
     found = instrumented_shapes(fit, candidate, column_cache, shapes)
     return (shapes,) if found == shapes else (found, shapes)
 
 
 def instrumented_shapes(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> Shapes:
-    """Continuous nonlinear parameters, one after the other, between their neighbours on the grid.
-
-    Effects of the motion alone keep theirs: that is simulated well; measured velocities are least accurate at
-    standstill.
-    """
+    """Continuous nonlinear parameters, one after the other, between their neighbours on the grid."""
     found = shapes
     if not candidate.effect.depends_on_torque:
         return found

@@ -4,13 +4,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.identification.equations import aligned_torque
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

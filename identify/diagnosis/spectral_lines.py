@@ -4,15 +4,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
+from armident.arrays import Array
 from armident.identify.diagnosis.stretch import MotionStretch
 from armident.identify.diagnosis.study import Study
 from armident.identify.identification.options import CONTROLLERS
 from armident.identify.signals.periodogram import hann_window, periodogram
-
-Array = NDArray[np.float64]
 
 BLOCK = 128
 """Independent frequencies from whose median the spectrum around a line is estimated."""
@@ -104,10 +102,7 @@ def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, low
 
 
 def of_references(study: Study, frequency: float) -> bool:
-    """Return true if the references contain the line, too: set points have a rate of their own.
-
-    The motion modulates the line, so its width is a share of the bandwidth of the motion.
-    """
+    """Return true if the references contain the line, too: set points have a rate of their own."""
     wide, criteria = study.criteria.modulated_line * bandwidth_of_motion(study), study.criteria
     recorded = study.loop in CONTROLLERS
     every = (joint for reference in study.auxiliary.references for joint in reference.T)
@@ -117,11 +112,7 @@ def of_references(study: Study, frequency: float) -> bool:
 
 
 def has_line(reference: Array, sample: float, frequency: float, wide: float, least: float, *, recorded: bool) -> bool:
-    """Return true if a reference (N,) has a line within ``wide``, Hz, with ``least`` times the power around it.
-
-    Where none is recorded, the measured motion stands for it, which a vibration shakes, too: set points come once in a
-    whole number of samples.
-    """
+    """Return true if a reference (N,) has a line within ``wide``, Hz, with ``least`` times the power around it."""
     spectrum = _Spectrum.of(np.diff(reference, 2), sample)
     sharp = 2 * PADDING * spectrum.f[1]
     samples = 1.0 / (frequency * sample)

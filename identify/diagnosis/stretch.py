@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.signals.differentiate import Derivatives
-
-Array = NDArray[np.float64]
 
 USUAL = 0.95
 """Quantile of the velocity of a joint that counts as its speed in a recording."""

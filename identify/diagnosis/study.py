@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.criteria import Criteria
@@ -42,8 +43,6 @@ from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.identify.signals.experiments import Experiment, check_one_rate
-
-Array = NDArray[np.float64]
 
 WORKING_RATE = 20.0
 """Rate at which effects are evaluated, over the frequency up to which model and data are compared: their harmonics up
@@ -103,10 +102,7 @@ class Study:
         return tuple(entry for entry in self.robot.effects if of_recording(entry))
 
     def of_robot(self, robot: RobotConfig) -> "Study":
-        """The same recordings for another model, corrected again where its effect entries require other corrections.
-
-        Other wiring is another arm. Other torque corrections keep the simulated motion: instruments need not be exact.
-        """
+        """The same recordings for another model, corrected again where its effect entries require other corrections."""
         changed = replace(self, robot=robot, model=self.model.with_effects_of(robot, terms_of(robot)))
         if changed.recorded == self.recorded:
             return changed
@@ -195,10 +191,7 @@ class Study:
         return rigid + self.terms(stretch, kind, theta) @ theta[-self.model.e :] if self.model.e else rigid
 
     def resimulated(self, theta: Array) -> "Study":
-        """The study with the closed-loop motion of its model at ``theta`` (b,), except experiments held out altogether.
-
-        The same where that loop diverges or follows the arm less closely: it may be too stiff (`robot.relaxation`).
-        """
+        """The study with the closed-loop motion of its model at ``theta`` (b,), unless that loop fails."""
         motions = self._simulated(theta, sorted({s.experiment for s in self.train}))
         if motions is None:
             return self
@@ -210,10 +203,7 @@ class Study:
         return replace(self, train=train, held=self._moved(self.held, motions))
 
     def with_first_motions(self, theta: Array) -> "Study":
-        """The study whose simulations begin with the torques of terms at the motion of its own loop.
-
-        Loops of models with one effect more or less then take one simulation instead of several.
-        """
+        """The study whose simulations begin with the torques of terms at the motion of its own loop."""
         if self.auxiliary.first_motions is None or not self.model.e:
             return self
         numbers = sorted({s.experiment for s in self.train})
@@ -375,10 +365,7 @@ def _simulated(
 
 
 def _seen(q: Array, measured: Derivatives, dt: float) -> Derivatives:
-    """Simulated motion after the smoother of the measured one.
-
-    Set points arrive in steps, which the smoother removes: columns at either should differ by the noise alone.
-    """
+    """Simulated motion after the smoother of the measured one."""
     assert measured.nvr is not None
     return replace(differentiate(q, dt, nvr=measured.nvr[:, 0]), start=measured.start)
 

@@ -27,6 +27,12 @@ class SignedDocument(Document):
 
     Parameters
     ----------
+    schema_
+        Name and version of the document.
+    robot
+        Name of the robot.
+    versions
+        Versions of Python and of the libraries.
     provenance
         Origin of the file: version of ``armident``, ``host``, ``user``, and ``time`` of the signature (UTC).
     signature

@@ -138,10 +138,6 @@ class CharacterisationDocument(SignedDocument):
 
     Parameters
     ----------
-    schema_
-        Name and version of the document.
-    robot
-        Name of the robot.
     joint
         Name of the joint.
     torque_unit, position_unit
@@ -152,8 +148,6 @@ class CharacterisationDocument(SignedDocument):
         Results; null where they cannot be determined.
     statements
         Each result in one line, or why it cannot be determined, with the next step.
-    versions
-        Versions of Python and of the libraries.
     """
 
     schema_: Literal["armident/characterisation/1"] = Field("armident/characterisation/1", alias="schema")

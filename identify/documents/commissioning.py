@@ -35,10 +35,6 @@ class CommissioningDocument(SignedDocument):
 
     Parameters
     ----------
-    schema_
-        Name and version of the document.
-    robot
-        Name of the robot.
     outcome
         ``trusted``; ``set_up``: the recordings contradict the configuration; ``not_trusted``: something is missing;
         ``stopped``: a motion was refused or stopped; ``running``: not ended.
@@ -52,8 +48,6 @@ class CommissioningDocument(SignedDocument):
         Verdict of the identification; null before it.
     held_out_error_pct_by_joint
         Error of the torques that the model predicts along a motion that it has not seen, percent of their norm.
-    versions
-        Versions of Python and of the libraries.
     """
 
     schema_: Literal["armident/commissioning/1"] = Field("armident/commissioning/1", alias="schema")

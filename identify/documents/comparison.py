@@ -104,10 +104,6 @@ class ComparisonDocument(SignedDocument):
 
     Parameters
     ----------
-    schema_
-        Key ``schema``: version of the document.
-    robot
-        Name of the robot.
     verdict
         Result of all tests together.
     baseline, now

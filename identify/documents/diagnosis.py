@@ -271,10 +271,6 @@ class DiagnosisDocument(SignedDocument):
 
     Parameters
     ----------
-    schema_
-        Name and version of the document.
-    robot
-        Name of the robot.
     recordings
         Recordings that were diagnosed.
     verdict
@@ -295,8 +291,6 @@ class DiagnosisDocument(SignedDocument):
         Robot configuration with the findings; null if there are none or it was not written.
     timing_s
         Time of each step, s.
-    versions
-        Versions of Python and of the libraries.
     warnings
         Messages of conversion and diagnosis.
     not_visible

@@ -69,10 +69,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield the name of an empty file that takes the place of ``path`` in the end; after an error there is none.
-
-    Missing folders are created. OSError names ``path``.
-    """
+    """Yield the name of an empty file that takes the place of ``path`` in the end; after an error there is none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     # Created like any other file, so that the umask decides who may read it.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")

@@ -185,14 +185,10 @@ class IdentificationDocument(SignedDocument):
 
     Parameters
     ----------
-    schema_
-        Name and version of the document.
     verdict
         Usability of the parameters by the limits in ``criteria``; null in documents of former versions.
     reasons
         Defects behind the verdict; empty for a trustworthy one.
-    robot
-        Name of the robot.
     recording
         Recording that was identified.
     method
@@ -224,8 +220,6 @@ class IdentificationDocument(SignedDocument):
         correlation analysis; parametric: cascade or PID gains; known: as configured.
     timing_s
         Time of each step, s.
-    versions
-        Versions of Python and of the libraries.
     warnings
         Messages of conversion and estimation.
     comparison

@@ -88,10 +88,6 @@ class InvestigationDocument(SignedDocument):
 
     Parameters
     ----------
-    schema_
-        Name and version of the document.
-    robot
-        Name of the robot.
     recordings
         Recordings from before the first motion.
     experiments
@@ -110,8 +106,6 @@ class InvestigationDocument(SignedDocument):
         Possible causes at each joint after the last recording.
     model
         Robot configuration with what was found; null if it was not written.
-    versions
-        Versions of Python and of the libraries.
     """
 
     schema_: Literal["armident/investigation/1"] = Field("armident/investigation/1", alias="schema")

@@ -18,10 +18,6 @@ class PredictionDocument(SignedDocument):
 
     Parameters
     ----------
-    schema_
-        Key ``schema``: version of the document.
-    robot
-        Name of the robot.
     model
         File of the model.
     method
@@ -44,8 +40,6 @@ class PredictionDocument(SignedDocument):
         Rate of these instants, Hz.
     warnings
         Remarks: motion beyond that of the identification, mistakes of the set-up.
-    versions
-        Versions of Python and libraries.
     """
 
     schema_: Literal["armident/prediction/1"] = Field("armident/prediction/1", alias="schema")
@@ -87,10 +81,6 @@ class PredictionsDocument(SignedDocument):
 
     Parameters
     ----------
-    schema_
-        Key ``schema``: version of the document.
-    robot
-        Name of the robot.
     model
         File of the model.
     worst_recording

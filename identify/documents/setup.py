@@ -42,10 +42,6 @@ class SetupDocument(SignedDocument):
 
     Parameters
     ----------
-    schema_
-        Name and version of the document.
-    robot
-        Name of the robot.
     recordings
         Recordings that were checked.
     passed
@@ -69,8 +65,6 @@ class SetupDocument(SignedDocument):
         was not estimated.
     repairs
         Faults of the signals that were repaired: wraps, impossible rows, drives that were off; empty if there are none.
-    versions
-        Versions of Python and of the libraries.
     """
 
     schema_: Literal["armident/check/1"] = Field("armident/check/1", alias="schema")

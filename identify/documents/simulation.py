@@ -12,10 +12,6 @@ class SimulationDocument(SignedDocument):
 
     Parameters
     ----------
-    schema_
-        Key ``schema``: version of the document.
-    robot
-        Name of the robot.
     physics
         ``virtual`` (Pinocchio) or ``identified`` (equations of the identification).
     trajectory, model, scenario

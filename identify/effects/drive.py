@@ -6,16 +6,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects.effect import UNITLESS, Linear, Periodic, Place, Shape, TorqueDependent, Trials
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.experiments import Experiment
 from armident.identify.signals.recursive import recursive_filter
-
-Array = NDArray[np.float64]
 
 LEAST = 0.1
 """Least squared ratio of a recorded torque to the true one in the correction of a saturated report."""
@@ -53,10 +51,7 @@ class Correction(TorqueDependent):
         """Return the values at which a diagnosis tests the correction, increasing in size for each sign."""
 
     def relative_slope(self, value: float) -> float:
-        """Return the change of the true torque by a change of the value, over that by a further small correction.
-
-        One for corrections that add up, such as delays.
-        """
+        """Return the change of the true torque by a change of the value, over that by a further small correction."""
         return 1.0
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
@@ -143,10 +138,7 @@ class DriveGainSaturation(Correction):
         return loss
 
     def true_torque(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
-        """Return ``i / sqrt(1 + 2 loss (i / limit)^2)``, sample by sample.
-
-        The saturation acts on the noise that the controller adds, too.
-        """
+        """Return ``i / sqrt(1 + 2 loss (i / limit)^2)``, sample by sample."""
         given: Array = recorded / np.sqrt(np.maximum(1.0 + 2.0 * value * (recorded / limit) ** 2, LEAST))
         return given
 

@@ -8,13 +8,12 @@ from itertools import combinations, permutations, product
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.robot.motion import Motion
 
-Array = NDArray[np.float64]
 Shapes = tuple[tuple[str, float], ...]
 """Nonlinear parameters as pairs of name and value."""
 

@@ -3,22 +3,17 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.effects.effect import POSITION, VELOCITY, Effect, Linear, Place, Shape, Trials
 from armident.identify.robot.motion import Motion
-
-Array = NDArray[np.float64]
 
 KNOTS = 9
 """Knots of a free shape over the range of its variable."""
 
 
 def hats(x: Array, knots: Sequence[float] | Array) -> Array:
-    """Return piecewise linear functions (N, k), one at each of the increasing knots, constant beyond them.
-
-    They are all one where the knots coincide: those of a signal that never changes.
-    """
+    """Return piecewise linear functions (N, k), one at each of the increasing knots, constant beyond them."""
     at = np.asarray(knots, dtype=np.float64)
     if x.dtype == object:
         # Symbols in place of numbers: a formula is derived, see `armident.identify.model_export.formulas`.

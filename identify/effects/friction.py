@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import ARITHMETIC, compiled
 from armident.identify.effects.effect import (
     POSITION,
@@ -24,8 +24,6 @@ from armident.identify.effects.effect import (
 from armident.identify.effects.free_shapes import TOP_SPEED, FreeShape, OverPosition, hats, table, values
 from armident.identify.effects.rotor import ROTOR, rotors
 from armident.identify.robot.motion import Motion
-
-Array = NDArray[np.float64]
 
 SLOWEST = 0.03
 """Least characteristic speed of a friction law over the joint's top speed: below it laws look like the reversal."""
@@ -232,10 +230,7 @@ class StribeckFrictionTable(FreeShape, StribeckBell):
         return ([motion.top_speed[place.joint]],)
 
     def possible(self, values: Array, shapes: Mapping[str, float]) -> bool:
-        """Return True if friction falls with the speed.
-
-        The value at rest is not judged alone: it contains the transition of dry friction at reversals.
-        """
+        """Return True if friction falls with the speed."""
         return bool(values[1] > 0.0 and values[1] >= values[-1] and values[0] + values[1] > 0.0)
 
 

@@ -3,15 +3,13 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.effects.effect import TORQUE, Effect, Linear, Place, TorqueDependent
 from armident.identify.effects.free_shapes import OverPosition, table, values
 from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.robot.chain import INERTIAL
 from armident.identify.robot.motion import Motion
-
-Array = NDArray[np.float64]
 
 
 class JointSpring(Effect):
@@ -202,10 +200,7 @@ class GravityDirection(TorqueDependent):
 
 
 class GravityDirectionOfVerticalJoint(GravityDirection):
-    """Tilt of the base of an arm whose first axis is vertical as configured.
-
-    Gravity along the axis never shows where the weight that turns with it is; across the axis it acts on that.
-    """
+    """Tilt of the base of an arm whose first axis is vertical as configured."""
 
     law = "vertical_joint"
     change_title = ""

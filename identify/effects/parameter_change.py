@@ -5,15 +5,13 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.effects.effect import TORQUE, VISCOUS, Effect, Linear, Place, Shapes
 from armident.identify.robot.motion import Motion
 
 if TYPE_CHECKING:
     from armident.identify.robot.arm import ArmModel
-
-Array = NDArray[np.float64]
 
 
 class ParameterChange(Effect):

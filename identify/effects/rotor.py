@@ -25,10 +25,7 @@ APART = 0.05
 
 
 def rotors(motion: Motion, joint: int) -> Sequence[float]:
-    """Return the rotor inertias to try, kg m^2 or kg: zero where the model has one, else shares of the link's inertia.
-
-    Base parameters without a rotor contain it in the link. It matters where load is not proportional to acceleration.
-    """
+    """Return the rotor inertias to try, kg m^2 or kg: zero where the model has one, else shares of the link's."""
     if f"ia{joint + 1}" in motion.model.base.names:
         return (0.0,)
     load, qdd = motion.transmitted[:, joint], motion.qdd[:, joint]

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects.effect import Effect, Linear, Place
@@ -12,8 +12,6 @@ from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.registry import of_entry
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.motion import Motion
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

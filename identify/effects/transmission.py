@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import ARITHMETIC, compiled
 from armident.identify.effects.effect import (
     POSITION,
@@ -20,8 +20,6 @@ from armident.identify.effects.effect import (
 from armident.identify.effects.rotor import ROTOR, rotors
 from armident.identify.robot.motion import Motion
 
-Array = NDArray[np.float64]
-
 DAMPINGS = (0.1, 0.7)
 """Damping ratios of an elastic joint: by its own damping, and with damping by the controlled motor."""
 
@@ -31,10 +29,7 @@ LEAST_INERTIA = 0.04
 
 
 class MotorOrder(Periodic):
-    """Effect whose one nonlinear parameter is an order of the motor angle.
-
-    A diagnosis finds it by order analysis of the residual instead of a grid.
-    """
+    """Effect whose one nonlinear parameter is an order of the motor angle."""
 
 
 class CoggingTorque(MotorOrder):
@@ -96,10 +91,7 @@ class JointElasticity(TorqueDependent):
     )
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
-        """Return the torques by `swinging` of the link.
-
-        ``frequency`` refers to the mean inertia over the arm's postures: the same stiffness in every motion.
-        """
+        """Return the torques by `swinging` of the link."""
         j, rotor = place.joint, shapes["rotor"]
         inertia, share = inertias(motion, j, rotor), np.ones(motion.samples)
         if inertia.max() > 0.0:
@@ -109,10 +101,7 @@ class JointElasticity(TorqueDependent):
         return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
 
     def least(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> float:
-        """Return half the compliance of the resonance of the link's mean inertia; 0 where that is not determined.
-
-        Less would need a heavier link. Half: as of a frequency that is 30 % too low.
-        """
+        """Return half the compliance of the resonance of the link's mean inertia; 0 where that is not determined."""
         inertia = self._usual(motion, place.joint, shapes["rotor"])
         return 0.5 / (inertia * (2 * np.pi * shapes["frequency"]) ** 2) if inertia > 0.0 else 0.0
 
@@ -170,10 +159,7 @@ class Backlash(TorqueDependent):
         return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
 
     def trial_values(self, motion: Motion, place: Place) -> Trials:
-        """Return gaps that the link crosses in 5 to 100 ms under the usual load, and `rotors`.
-
-        An error of 25 % in the gap misses the instants of the impacts.
-        """
+        """Return gaps that the link crosses in 5 to 100 ms under the usual load, and `rotors`."""
         usual = max(float(np.std(falls(motion, place.joint))), 1e-9)
         gaps = [0.5 * usual * float(time) ** 2 for time in np.geomspace(0.005, 0.1, 25)]
         return gaps, rotors(motion, place.joint)
@@ -211,10 +197,7 @@ def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
 
 
 def inertias(motion: Motion, joint: int, rotor: float) -> Array:
-    """Return the inertia (N,) of the link that a gear drives, kg m^2 or kg; at least `LEAST_INERTIA`.
-
-    Zero where the fit has no inertia. ``rotor``: rotor inertia that the model contains in the link.
-    """
+    """Return the inertia (N,) of the link that a gear drives, kg m^2 or kg; at least `LEAST_INERTIA`."""
     inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
     believed: Array = np.maximum(inertia, LEAST_INERTIA * inertia.max())
     return believed

@@ -4,13 +4,11 @@ from collections.abc import Mapping
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.effects.effect import POSITION, TORQUE, VELOCITY, Linear, Place, Shape, TorqueDependent, Trials
 from armident.identify.effects.free_shapes import TOP_SPEED, FreeShape, ends, hats, table, values
 from armident.identify.robot.motion import Motion
-
-Array = NDArray[np.float64]
 
 NAME = "unnamed"
 """Name of these effects in documents and configurations; the law is the variable."""

@@ -5,16 +5,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects.effect import POSITION, UNITLESS, Effect, Place, Scope, Shape, Shapes
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.experiments import Experiment
 from armident.identify.signals.streamed import mapped
-
-Array = NDArray[np.float64]
 
 SIGNALS = ("position", "torque")
 """Parameters of these effects: a value of 1 selects the signal; of `signal_scale` it is the factor."""

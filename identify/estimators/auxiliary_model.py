@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.regression.equations import ExperimentEquations, filtered_regressor, thinned_regressor
 from armident.identify.robot.arm import ArmModel
@@ -41,13 +41,10 @@ class _Diverged(Exception):
 
 @dataclass(frozen=True)
 class Response:
-    """Response of the simulated loop, filtered and decimated like the equations.
+    """Simulated torques, N m or N, and positions, rad or m, (M, n) per experiment, filtered and decimated."""
 
-    ``torque``, ``position``: one (M, n) array per experiment, N m or N, rad or m.
-    """
-
-    torque: tuple[NDArray[np.float64], ...]
-    position: tuple[NDArray[np.float64], ...]
+    torque: tuple[Array, ...]
+    position: tuple[Array, ...]
 
 
 @dataclass
@@ -72,20 +69,20 @@ class AuxiliaryModel:
 
     model: ArmModel
     controller: DiscreteController
-    references: Sequence[NDArray[np.float64]]
-    initial: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
+    references: Sequence[Array]
+    initial: Sequence[tuple[Array, Array]]
     dt: float
     decimation: Decimation
-    max_velocity: NDArray[np.float64]
-    anchor: NDArray[np.float64] | None = None
+    max_velocity: Array
+    anchor: Array | None = None
     band_hz: float = np.inf
     starts: Sequence[float] | None = None
-    measured: Callable[[NDArray[np.float64], int], Derivatives] | None = None
+    measured: Callable[[Array, int], Derivatives] | None = None
     feedback: bool = True
     rounds: int = ROUNDS
     tolerated: float = 0.0
     first_motions: Sequence[Derivatives] | None = None
-    _last: NDArray[np.float64] | None = None
+    _last: Array | None = None
     _warnings: list[str] = field(default_factory=list)
     _simulated: list[tuple[tuple[object, ...], bytes, Sequence[Simulation]]] = field(default_factory=list, repr=False)
 
@@ -117,9 +114,7 @@ class AuxiliaryModel:
             first_motions=None if self.first_motions is None else chosen(self.first_motions, numbers),
         )
 
-    def simulate(
-        self, theta: NDArray[np.float64], disturbances: Sequence[NDArray[np.float64]] | None = None
-    ) -> Sequence[Simulation] | None:
+    def simulate(self, theta: Array, disturbances: Sequence[Array] | None = None) -> Sequence[Simulation] | None:
         """All experiments with base parameters (b,), or ``None`` if one diverges or theta is not finite.
 
         ``disturbances``: additional motor torques (N, n) per experiment, N m or N.
@@ -135,7 +130,7 @@ class AuxiliaryModel:
                 if of == theta.tobytes() and all(a is b for a, b in zip(parts, loop, strict=True)):
                     return runs
 
-        def run(k: int, q_ref: NDArray[np.float64]) -> Simulation:
+        def run(k: int, q_ref: Array) -> Simulation:
             q0, qd0 = self.initial[k]
             found = simulate_with_terms(
                 self.model,
@@ -165,24 +160,21 @@ class AuxiliaryModel:
             self._simulated[:] = [(loop, theta.tobytes(), made)]
         return made
 
-    def respond(self, theta: NDArray[np.float64]) -> Response | None:
+    def respond(self, theta: Array) -> Response | None:
         """Simulated torques and positions after the parallel filter, or ``None`` if the simulation diverges."""
         runs = self.simulate(theta)
         return None if runs is None else self._filtered(runs)
 
-    def respond_many(self, thetas: Sequence[NDArray[np.float64]]) -> list[Response | None]:
+    def respond_many(self, thetas: Sequence[Array]) -> list[Response | None]:
         """`respond` for many parameter vectors at once, on all processors: simulations hold no interpreter lock."""
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
             return list(pool.map(self.respond, thetas))
 
-    def instruments(self, theta: NDArray[np.float64]) -> Sequence[NDArray[np.float64]]:
-        """Filtered regressor at few samples of simulated signals, one (M, n, b) per experiment.
-
-        Raises DataError if no point between theta and the last good estimate can be simulated.
-        """
+    def instruments(self, theta: Array) -> Sequence[Array]:
+        """Filtered regressor at few samples of simulated signals, one (M, n, b) per experiment."""
         return self.regressors(self.motions(theta), thinned=True)
 
-    def motions(self, theta: NDArray[np.float64]) -> Sequence[Derivatives]:
+    def motions(self, theta: Array) -> Sequence[Derivatives]:
         """Simulated signals of every experiment; raises DataError like `instruments`."""
         return self.motions_of(self._nearest(theta)[1])
 
@@ -191,27 +183,17 @@ class AuxiliaryModel:
         starts = [self._start(k) for k in range(len(runs))]
         return mapped(lambda run, start: Derivatives(run.q, run.qd, run.qdd, None, self.dt, start), runs, starts)
 
-    def regressors(self, motions: Sequence[Derivatives], *, thinned: bool = False) -> Sequence[NDArray[np.float64]]:
-        """Filtered regressor at noise-free motions, one (M, n, b) per experiment.
-
-        Parameters
-        ----------
-        motions
-            Signals of every experiment.
-        thinned
-            Compute it at few samples, which is enough for instruments.
-        """
+    def regressors(self, motions: Sequence[Derivatives], *, thinned: bool = False) -> Sequence[Array]:
+        """Filtered regressor (M, n, b) of each experiment without noise; ``thinned``: at few samples."""
         regressor = thinned_regressor if thinned else filtered_regressor
         seen = (self._in_band(motion, k) for k, motion in enumerate(motions))
         return kept((regressor(self.model, motion, self.decimation) for motion in seen), like=motions)
 
-    def equations(
-        self, blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]
-    ) -> Sequence[ExperimentEquations]:
+    def equations(self, blocks: Sequence[ExperimentEquations], theta: Array) -> Sequence[ExperimentEquations]:
         """Equations with the regressor simulated at theta (b,) (2.32); DataError like `instruments`."""
         return mapped(lambda block, zeta: replace(block, x=zeta), blocks, self.regressors(self.motions(theta)))
 
-    def reachable(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], Response]:
+    def reachable(self, theta: Array) -> tuple[Array, Response]:
         """Theta and its response, or of the nearest point towards the last good estimate; DataError if none."""
         near, runs = self._nearest(theta)
         return near, self._filtered(runs)
@@ -234,7 +216,7 @@ class AuxiliaryModel:
             tuple(self.decimation(run.q) for run in runs),
         )
 
-    def _nearest(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], Sequence[Simulation]]:
+    def _nearest(self, theta: Array) -> tuple[Array, Sequence[Simulation]]:
         """Theta, or the first point on the way back from it that can be simulated."""
         runs = self.simulate(theta)
         if runs is not None:
@@ -257,12 +239,12 @@ class AuxiliaryModel:
                 return target, runs
         raise DataError("the auxiliary closed loop cannot be simulated: it diverges between all estimates tried")
 
-    def _postures(self) -> NDArray[np.float64]:
+    def _postures(self) -> Array:
         total = sum(q_ref.shape[0] for q_ref in self.references)
         return np.concatenate([q_ref[:: max(1, total // REFERENCE_POSTURES)].copy() for q_ref in self.references])
 
 
-def _at_samples(held: NDArray[np.float64]) -> NDArray[np.float64]:
+def _at_samples(held: Array) -> Array:
     """Torques (N, n) at the samples: the mean of those held before and after, as the simulated accelerations are."""
     at = held.copy()
     at[1:] = 0.5 * (held[1:] + held[:-1])

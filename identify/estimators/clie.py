@@ -2,22 +2,14 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.output_error import output_error
 from armident.identify.estimators.problem import Estimator, Solved
 from armident.identify.regression.equations import Estimate, ExperimentEquations
-from armident.identify.regression.iterations import ITERATIONS
 
 
-def clie(
-    blocks: Sequence[ExperimentEquations],
-    auxiliary: AuxiliaryModel,
-    start: NDArray[np.float64],
-    iterations: int = ITERATIONS,
-) -> Estimate:
+def clie(blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array) -> Estimate:
     """Minimise the input error ``tau - tau_s`` (4.3, 4.4).
 
     Parameters
@@ -28,8 +20,6 @@ def clie(
         The simulated closed loop with the true controller; its torques pass the same filter.
     start
         First theta, shape (b,).
-    iterations
-        Most steps; each costs one simulation, and b more where the sensitivities are renewed.
 
     Returns
     -------
@@ -41,7 +31,7 @@ def clie(
     DataError
         If the closed loop cannot be simulated with ``start``.
     """
-    return output_error(lambda r: r.torque, [b.y for b in blocks], blocks, auxiliary.fresh(), start, iterations)
+    return output_error(lambda r: r.torque, [b.y for b in blocks], blocks, auxiliary.fresh(), start)
 
 
 ESTIMATOR = Estimator(

@@ -2,23 +2,16 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.output_error import output_error
 from armident.identify.estimators.problem import Estimator, Problem, Solved
 from armident.identify.regression.equations import Estimate, ExperimentEquations
-from armident.identify.regression.iterations import ITERATIONS
 
 
 def cloe(
-    blocks: Sequence[ExperimentEquations],
-    positions: Sequence[NDArray[np.float64]],
-    auxiliary: AuxiliaryModel,
-    start: NDArray[np.float64],
-    iterations: int = ITERATIONS,
+    blocks: Sequence[ExperimentEquations], positions: Sequence[Array], auxiliary: AuxiliaryModel, start: Array
 ) -> Estimate:
     """Minimise the output error ``q_m - q_s`` (4.1, 4.2).
 
@@ -32,8 +25,6 @@ def cloe(
         The simulated closed loop with the true controller; its positions pass the same filter.
     start
         First theta, shape (b,).
-    iterations
-        Most steps; each costs one simulation, and b more where the sensitivities are renewed.
 
     Returns
     -------
@@ -49,7 +40,7 @@ def cloe(
     shapes, expected = [p.shape for p in positions], [b.y.shape for b in blocks]
     if shapes != expected:
         raise DataError(f"positions of shapes {shapes} do not belong to equations of shapes {expected}")
-    return output_error(lambda r: r.position, positions, blocks, auxiliary.fresh(), start, iterations)
+    return output_error(lambda r: r.position, positions, blocks, auxiliary.fresh(), start)
 
 
 def _solve(problem: Problem) -> Solved:

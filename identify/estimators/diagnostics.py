@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.special import fdtrc
 
+from armident.arrays import Array
 from armident.identify.estimators.instrument_tests import (
     SIGNIFICANCE,
     Endogeneity,
@@ -28,8 +29,6 @@ from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.regression.iv import serial_covariance
 from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.regression.whitening import whitened
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

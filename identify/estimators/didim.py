@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.problem import Estimator, Solved
 from armident.identify.estimators.sensitivity import torque_sensitivities
@@ -17,18 +17,13 @@ from armident.identify.regression.equations import (
     stacked_parts,
     whitened_residuals,
 )
-from armident.identify.regression.iterations import ITERATIONS, Iterations, iterate
+from armident.identify.regression.iterations import Iterations, iterate
 from armident.identify.regression.iv import factored
 from armident.identify.regression.least_squares import Triangle
 
 
 def didim(
-    blocks: Sequence[ExperimentEquations],
-    auxiliary: AuxiliaryModel,
-    start: NDArray[np.float64],
-    iterations: int = ITERATIONS,
-    *,
-    true_sensitivities: bool = False,
+    blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array, *, true_sensitivities: bool = False
 ) -> Estimate:
     """Iterate least squares of the measured torque on the simulated regressor (2.36).
 
@@ -40,8 +35,6 @@ def didim(
         The simulated closed loop with the true controller; its regressor passes the same filter.
     start
         First theta of the auxiliary model, shape (b,).
-    iterations
-        Most iterations.
     true_sensitivities
         Covariance with the Jacobian of the simulated torque, for b more simulations.
 
@@ -57,7 +50,7 @@ def didim(
         If no auxiliary model runs, not even the first.
     """
     auxiliary = auxiliary.fresh()
-    (theta, done, converged, reason), simulated = solve_didim(blocks, auxiliary, start, iterations)
+    (theta, done, converged, reason), simulated = solve_didim(blocks, auxiliary, start)
     noise = joint_variances(simulated, theta)
     if true_sensitivities:
         z, y = stacked(simulated, noise)
@@ -69,22 +62,19 @@ def didim(
 
 
 def solve_didim(
-    blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: NDArray[np.float64], iterations: int
+    blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array
 ) -> tuple[Iterations, Sequence[ExperimentEquations]]:
-    """Iterations of DIDIM (2.36), and the equations of every experiment simulated at their last theta.
-
-    Raises DataError if no auxiliary model runs, not even the first.
-    """
+    """Iterations of DIDIM (2.36), and the equations of every experiment simulated at their last theta."""
     scale = noise = joint_variances(blocks, np.zeros_like(start))
 
-    def step(previous: NDArray[np.float64], _: int) -> tuple[NDArray[np.float64], float]:
+    def step(previous: Array, _: int) -> tuple[Array, float]:
         nonlocal noise
         simulated = auxiliary.equations(blocks, previous)
         estimate = Triangle.of(stacked_parts(simulated, noise)).theta  # 2.36
         noise = joint_variances(simulated, estimate)
         return estimate, residual_norm(simulated, estimate, scale)
 
-    end = iterate(step, start, iterations)
+    end = iterate(step, start)
     return end, auxiliary.equations(blocks, end.theta)
 
 

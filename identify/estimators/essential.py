@@ -4,12 +4,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtri
 
+from armident.arrays import Array
+
 CONFIDENCE = 0.99
 """A parameter is essential if leaving it out raises the weighted error beyond this quantile of F."""
 
 
 def essential_parameters(
-    theta: NDArray[np.float64], covariance: NDArray[np.float64], equations: int, confidence: float = CONFIDENCE
+    theta: Array, covariance: Array, equations: int, confidence: float = CONFIDENCE
 ) -> NDArray[np.bool_]:
     """Mask (b,) of the essential parameters, by backward elimination with an F statistic (thesis B.2).
 

@@ -7,6 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.regression.ar_noise import ArModel, fit_spectrum
 from armident.identify.regression.equations import ExperimentEquations
@@ -29,7 +30,7 @@ class InverseController:
     transmission. ``shapes``: one ``D_j`` and its scale for each motor.
     """
 
-    to_motor: NDArray[np.float64]
+    to_motor: Array
     shapes: tuple[ArModel, ...]
 
     @classmethod
@@ -40,10 +41,7 @@ class InverseController:
         return cls(inverse, tuple(fit_spectrum(1.0 / row**2, order) for row in gain))
 
     def __call__(self, blocks: Sequence[ExperimentEquations]) -> list[ExperimentEquations]:
-        """The same equations, torques (M, n) and regressor (M, n, b), at the motors and through ``C_j^-1``.
-
-        An equation of a motor is kept where those of all joints that load it are.
-        """
+        """The same equations, torques (M, n) and regressor (M, n, b), at the motors and through ``C_j^-1``."""
         return [
             ExperimentEquations(
                 self._filtered(block.y @ self.to_motor),
@@ -54,7 +52,7 @@ class InverseController:
             for block in blocks
         ]
 
-    def _filtered(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _filtered(self, values: Array) -> Array:
         out = np.empty_like(values)
         for j, shape in enumerate(self.shapes):
             recursion = np.append(1.0, shape.coefficients)
@@ -62,18 +60,15 @@ class InverseController:
         return out
 
 
-def controller_gain(controller: DiscreteController, factor: int) -> NDArray[np.float64]:
-    """Gain (n, K) of each motor's controller from position noise to torque, up to the decimated Nyquist frequency.
-
-    Position noise enters with the tracking error and, in a velocity loop, with the position itself.
-    """
+def controller_gain(controller: DiscreteController, factor: int) -> Array:
+    """Gain (n, K) of each motor's controller from position noise to torque, up to the decimated Nyquist frequency."""
     z = np.exp(-1j * np.pi * np.linspace(0.0, 1.0, FREQUENCIES) / factor)
 
-    def response(taps: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def response(taps: Array) -> NDArray[np.complex128]:
         total: NDArray[np.complex128] = taps @ z[None, :] ** np.arange(taps.shape[1])[:, None]
         return total
 
     forward = response(controller.error_taps) - response(controller.position_taps)
     gain = np.abs(forward / (1.0 - z * response(controller.output_taps)))
-    floored: NDArray[np.float64] = np.maximum(gain, SMALLEST_GAIN * gain.max(axis=1, keepdims=True))
+    floored: Array = np.maximum(gain, SMALLEST_GAIN * gain.max(axis=1, keepdims=True))
     return floored

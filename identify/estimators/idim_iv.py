@@ -2,9 +2,7 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.problem import Estimator, Problem, Solved
 from armident.identify.regression.equations import (
@@ -17,18 +15,13 @@ from armident.identify.regression.equations import (
     residual_norm,
     whitened_residuals,
 )
-from armident.identify.regression.iterations import ITERATIONS, iterate
+from armident.identify.regression.iterations import iterate
 from armident.identify.regression.iv import IvProducts, factored_parts, instrumented_parts, serial_covariance
 from armident.identify.signals.streamed import mapped
 
 
 def idim_iv(
-    blocks: Sequence[ExperimentEquations],
-    auxiliary: AuxiliaryModel,
-    start: NDArray[np.float64],
-    iterations: int = ITERATIONS,
-    *,
-    serial_order: int = 0,
+    blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array, *, serial_order: int = 0
 ) -> Estimate:
     """Iterate 2.33 with weights 2.24 to 2.26 on the instruments, the regressor and the torques alike.
 
@@ -40,8 +33,6 @@ def idim_iv(
         The simulated closed loop; its instruments pass the same filter.
     start
         First theta of the auxiliary model, shape (b,).
-    iterations
-        Most iterations.
     serial_order
         Highest order of an AR model of each joint's residuals, used for the covariance alone; 0: the residuals
         count as white (2.34).
@@ -54,16 +45,16 @@ def idim_iv(
     auxiliary = auxiliary.fresh()
     scale = noise = joint_variances(blocks, start)
 
-    def products(zeta: Sequence[NDArray[np.float64]]) -> IvProducts:
+    def products(zeta: Sequence[Array]) -> IvProducts:
         return factored_parts(instrumented_parts(instrumented(blocks, zeta), noise), start.size)
 
-    def step(previous: NDArray[np.float64], _: int) -> tuple[NDArray[np.float64], float]:
+    def step(previous: Array, _: int) -> tuple[Array, float]:
         nonlocal noise
         estimate = products(auxiliary.instruments(previous)).theta  # 2.33
         noise = joint_variances(blocks, estimate)
         return estimate, residual_norm(blocks, estimate, scale)
 
-    theta, done, converged, reason = iterate(step, start, iterations)
+    theta, done, converged, reason = iterate(step, start)
     noise = joint_variances(blocks, theta)
     zeta = auxiliary.instruments(theta)
     covariance = products(zeta).covariance

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.grey_box import InverseController
 from armident.identify.estimators.idim_iv import idim_iv
@@ -43,7 +43,7 @@ NO_REFERENCE_CAUSE = f"{CONTRADICTION_CAUSE}, or the instruments, which follow t
 def idim_piv(
     blocks: Sequence[ExperimentEquations],
     auxiliary: AuxiliaryModel,
-    start: NDArray[np.float64],
+    start: Array,
     iterations: int = ITERATIONS,
     max_order: int = MAX_AR_ORDER,
     *,
@@ -87,11 +87,11 @@ def idim_piv(
     scale = joint_variances(measured, start)
     noise: list[ArModel] = scale  # step 1: H = 1, lambda from the start
 
-    def solved(at: NDArray[np.float64]) -> IvProducts:
+    def solved(at: Array) -> IvProducts:
         simulated = mapped(lambda block, zeta: replace(block, x=zeta), blocks, auxiliary.instruments(at))
         return iv_products(instrumented(measured, mapped(lambda block: block.x, seen(simulated))), noise)  # 6.30
 
-    def step(previous: NDArray[np.float64], k: int) -> tuple[NDArray[np.float64], float]:
+    def step(previous: Array, k: int) -> tuple[Array, float]:
         nonlocal noise
         products = solved(previous)  # steps 2a and 2b
         estimate = products.theta
@@ -138,11 +138,8 @@ def _solve(problem: Problem) -> Solved:
     return Solved(without, plain=True, reasons=(reason,))
 
 
-def _difference_without_model_error(problem: Problem, estimate: Estimate, without: Estimate) -> NDArray[np.float64]:
-    """Difference (b,) of IDIM-PIV and IDIM-IV on data of exactly the model; zero where no loop can be simulated.
-
-    The prefilter weights high frequencies, at which the smoothed derivatives of few noisy samples are wrong.
-    """
+def _difference_without_model_error(problem: Problem, estimate: Estimate, without: Estimate) -> Array:
+    """Difference (b,) of IDIM-PIV and IDIM-IV on data of exactly the model; zero where no loop can be simulated."""
     refined = problem.bias(estimate, prefiltered=True)
     plain = problem.plain_problem.bias(without, prefiltered=False)
     return np.zeros_like(without.theta) if refined is None or plain is None else refined - plain

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.special import chdtrc
 
+from armident.arrays import Array
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.regression.hac import newey_west
@@ -19,8 +20,6 @@ from armident.identify.regression.iv import factored
 from armident.identify.regression.least_squares import inverse_gram, least_squares
 from armident.identify.regression.whitening import whitened
 from armident.identify.signals.recursive import recursive_filter
-
-Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
 """Probability of rejecting a true hypothesis, in every test of an estimate except those of its residuals."""

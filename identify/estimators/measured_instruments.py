@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
@@ -28,24 +28,19 @@ class MotionInstruments(AuxiliaryModel):
     """
 
     @classmethod
-    def of(cls, model: ArmModel, motion: Sequence[NDArray[np.float64]], dt: float, decimation: Decimation) -> Self:
+    def of(cls, model: ArmModel, motion: Sequence[Array], dt: float, decimation: Decimation) -> Self:
         """Instruments from smoothed joint positions, one (N, n) array per experiment, rad or m."""
         # Neither controller nor initial state has a part in it.
         controller = DiscreteController.fir(np.zeros((model.n, 1)), dt)
         at_rest = [(q[0].copy(), np.zeros(model.n)) for q in motion]
         return cls(model, controller, motion, at_rest, dt, decimation, np.full(model.n, np.inf), feedback=False)
 
-    def simulate(
-        self, theta: NDArray[np.float64], disturbances: Sequence[NDArray[np.float64]] | None = None
-    ) -> Sequence[Simulation] | None:
-        """The motion of every experiment, with the torques that base parameters (b,) need for it.
-
-        ``disturbances`` have no effect: the motion is given.
-        """
+    def simulate(self, theta: Array, disturbances: Sequence[Array] | None = None) -> Sequence[Simulation] | None:
+        """The motion of every experiment, with the torques that base parameters (b,) need for it."""
         if not np.isfinite(theta).all():
             return None
 
-        def run(k: int, q: NDArray[np.float64]) -> Simulation:
+        def run(k: int, q: Array) -> Simulation:
             qd = central_difference(q, self.dt)
             qdd = central_difference(qd, self.dt)
             tau = self.model.inverse_dynamics(theta, q, qd, qdd)

@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel, Response
 from armident.identify.estimators.didim import solve_didim
-from armident.identify.estimators.sensitivity import Array, Arrays, difference_steps, sensitivities, weighted_columns
+from armident.identify.estimators.sensitivity import Arrays, difference_steps, sensitivities, weighted_columns
 from armident.identify.regression.ar_noise import ArModel, ar_models
 from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.regression.iterations import TOLERANCE, iterate
@@ -33,12 +34,7 @@ NEAR = 3.0
 
 
 def output_error(
-    signal: Signal,
-    measured: Arrays,
-    blocks: Sequence[ExperimentEquations],
-    auxiliary: AuxiliaryModel,
-    start: Array,
-    iterations: int,
+    signal: Signal, measured: Arrays, blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array
 ) -> Estimate:
     """Minimise the weighted difference between a measured and a simulated ``signal`` of a response (4.1 to 4.4).
 
@@ -48,7 +44,7 @@ def output_error(
     residuals. ``auxiliary``: not yet used by another estimator. Raises DataError if no loop near ``start`` (b,) can be
     simulated.
     """
-    search = _approach(signal, measured, blocks, auxiliary, start, iterations)
+    search = _approach(signal, measured, blocks, auxiliary, start)
     scale = search.variances()
     keep = search.keep
 
@@ -56,7 +52,7 @@ def output_error(
         search.step()
         return search.theta, float(np.linalg.norm(whitened(search.errors(), scale, keep)))
 
-    theta, done, converged, reason = iterate(step, search.theta, iterations)
+    theta, done, converged, reason = iterate(step, search.theta)
     if search.stuck:
         converged, reason = False, "no step lowers the error although the sensitivities promise it"
     noise = search.variances()
@@ -66,16 +62,11 @@ def output_error(
 
 
 def _approach(
-    signal: Signal,
-    measured: Arrays,
-    blocks: Sequence[ExperimentEquations],
-    auxiliary: AuxiliaryModel,
-    start: Array,
-    iterations: int,
+    signal: Signal, measured: Arrays, blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array
 ) -> "_LevenbergMarquardt":
     """Start of the minimisation: the given parameters, or those of pseudo-linear regression (4.22) if better."""
     given = _LevenbergMarquardt(signal, measured, blocks, auxiliary, *auxiliary.reachable(start))
-    near, _ = solve_didim(blocks, auxiliary, given.theta, iterations)
+    near, _ = solve_didim(blocks, auxiliary, given.theta)
     found = _LevenbergMarquardt(signal, measured, blocks, auxiliary, *auxiliary.reachable(near.theta))
     return min(given, found, key=_LevenbergMarquardt.log_likelihood_loss)
 

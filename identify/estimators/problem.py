@@ -4,15 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.methods import Method
 from armident.identify.estimators.reason import Reason
 from armident.identify.regression.equations import Estimate, ExperimentEquations
-
-Array = NDArray[np.float64]
 
 JOINT_TORQUE = "joint torque"
 

@@ -7,13 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from armident.arrays import Array
 from armident.identify.regression.ar_noise import ArModel, lagged_sums
 from armident.identify.regression.equations import Estimate, ExperimentEquations
-
-Array = NDArray[np.float64]
 
 FALSE_ALARM_RATE = 0.01
 """Probability that the tests of one kind reject the residuals of any joint of a correct model (Bonferroni)."""

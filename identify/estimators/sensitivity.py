@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel, Response
 from armident.identify.regression.ar_noise import ArModel, ar_models
 from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.regression.least_squares import column_norms
 from armident.identify.regression.whitening import whitened
 
-Array = NDArray[np.float64]
 Arrays = Sequence[Array]
 
 DIFFERENCE = 0.01

@@ -2,9 +2,7 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.didim import solve_didim
 from armident.identify.estimators.problem import Estimator, Problem, Solved
@@ -17,17 +15,12 @@ from armident.identify.regression.equations import (
     stacked_parts,
     whitened_residuals,
 )
-from armident.identify.regression.iterations import ITERATIONS
 from armident.identify.regression.least_squares import Triangle
 from armident.identify.regression.orders import MAX_AR_ORDER
 
 
 def sep_pem(
-    blocks: Sequence[ExperimentEquations],
-    auxiliary: AuxiliaryModel,
-    start: NDArray[np.float64],
-    iterations: int = ITERATIONS,
-    max_order: int = MAX_AR_ORDER,
+    blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array, max_order: int = MAX_AR_ORDER
 ) -> Estimate:
     """DIDIM on equations with little or no decimation, whose residuals an AR model per joint whitens (6.26, 6.27).
 
@@ -39,8 +32,6 @@ def sep_pem(
         The simulated closed loop with the true controller, same filter.
     start
         First theta of the auxiliary model, shape (b,).
-    iterations
-        Most iterations.
     max_order
         Highest AR order tried; the thesis finds 141 on average at 5 kHz.
 
@@ -55,7 +46,7 @@ def sep_pem(
         If no auxiliary model runs, not even the first.
     """
     auxiliary = auxiliary.fresh()
-    (theta, done, converged, reason), simulated = solve_didim(blocks, auxiliary, start, iterations)  # step 1
+    (theta, done, converged, reason), simulated = solve_didim(blocks, auxiliary, start)  # step 1
     noise = joint_variances(simulated, theta)
     covariance = Triangle.of(stacked_parts(simulated, noise)).inverse_gram
     for _ in range(COVARIANCE_PASSES):

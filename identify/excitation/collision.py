@@ -9,14 +9,12 @@ from itertools import combinations
 
 import coal
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.collision import BASE, Box, Collision, LinkCapsule
 from armident.identify.robot.chain import Chain, chain_of, link_frames
-
-Array = NDArray[np.float64]
 
 JOINT_ZONE = 1.5
 """Distance from a joint's axis, over radii plus clearance, up to which its two links may touch. Beyond it they touch

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal import butter, sosfiltfilt
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig, Trajectory
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.collision import ClosestApproach, CollisionModel
@@ -33,7 +34,6 @@ from armident.identify.excitation.point_to_point import (
 )
 from armident.identify.excitation.trajectory_options import Shape
 from armident.identify.robot.arm import ArmModel
-from armident.identify.robot.chain import Floats
 from armident.identify.signals.decimate import design
 
 C = TypeVar("C")
@@ -61,12 +61,12 @@ class Design:
 
     trajectory: Trajectory
     condition: float
-    std: Floats | None
-    slow_share: Floats
-    torque: Floats | None = None
+    std: Array | None
+    slow_share: Array
+    torque: Array | None = None
     wanted: dict[str, float] | None = None
     closest: ClosestApproach | None = None
-    torque_std: Floats | None = None
+    torque_std: Array | None = None
 
 
 def design_trajectory(
@@ -178,10 +178,7 @@ def _search(
 def with_objective(
     robot: RobotConfig, wanted: str | None, joint: str | None, against: str | None, theta: ArrayLike | None = None
 ) -> EffectObjective | None:
-    """Return the objective of the options ``--for``, ``--joint`` and ``--against``; ``None`` without ``--for``.
-
-    Speeds and loads at which the effect is to be visible are those of a typical trajectory of the robot.
-    """
+    """Return the objective of the options ``--for``, ``--joint`` and ``--against``; ``None`` without ``--for``."""
     if wanted is None:
         for option, value in (("--joint", joint), ("--against", against)):
             if value is not None:

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.configs import Trajectory
 from armident.configs.schema.trajectory import Fourier
 from armident.identify.excitation.point_to_point import PointToPointSearch, Rank
-from armident.identify.robot.chain import Floats
 
 HIGHEST_HZ = 1.6
 """Frequency of the highest harmonic, Hz: above it the velocity limits allow only small amplitudes."""
@@ -32,9 +32,9 @@ class FourierSeries:
     ``share`` (n,) of the amplitude that the limits allow; ``middle`` (n,) of the motion in the free range, 0 to 1.
     """
 
-    coefficients: Floats
-    share: Floats
-    middle: Floats
+    coefficients: Array
+    share: Array
+    middle: Array
 
 
 class FourierSearch:

@@ -4,12 +4,10 @@ from collections.abc import Iterable
 
 import coal
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs.schema.collision import LinkCapsule
 from armident.configs.urdf_shapes import UrdfShape
-
-Array = NDArray[np.float64]
 
 SMALLEST = 1e-3
 """Smallest radius of a capsule, m; flat and thin shapes have this one."""

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig
 from armident.identify.diagnosis.candidates import Shapes
 from armident.identify.effects.effect import Effect, Place
@@ -15,8 +16,6 @@ from armident.identify.effects.registry import known
 from armident.identify.effects.wiring import SignalMistake
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.decimate import Decimation
-
-Array = NDArray[np.float64]
 
 TYPICAL = (0.25, 0.5, 0.75)
 """Assumed values of an unknown nonlinear parameter, as positions in its grid."""
@@ -75,11 +74,7 @@ class EffectObjective:
 def effect_objective(
     robot: RobotConfig, wanted: str, joint: str | None, against: str | None, motion: Motion
 ) -> EffectObjective:
-    """Return the objective for an effect at one joint or at all joints.
-
-    ``motion``: typical motion; its speeds and loads give the nonlinear parameters. Raises ConfigError if the robot has
-    no such effect or joint, or any motion shows the effect.
-    """
+    """Return the objective for an effect at one joint or at all joints."""
     effect, rival = _designable(wanted, "--for"), None if against is None else _designable(against, "--against")
     if rival is not None and rival.name == effect.name:
         raise ConfigError(f"--against {against}: expected another effect than --for")

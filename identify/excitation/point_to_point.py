@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig, Trajectory
 from armident.configs.schema.trajectory import RAMP_SHARE, Move
 from armident.identify.excitation.collision import CollisionModel
 from armident.identify.excitation.objective import EffectObjective, weighted_rows
 from armident.identify.robot.arm import ArmModel
-from armident.identify.robot.chain import Floats
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.decimate import Decimation, design
 
@@ -88,10 +88,10 @@ class Rank(NamedTuple):
 WORST = Rank(np.inf, np.inf)
 
 
-def slow_share(robot: RobotConfig, qd: Floats) -> Floats:
+def slow_share(robot: RobotConfig, qd: Array) -> Array:
     """Return the share (n,) of samples with a velocity below `SLOW` of its limit."""
     limit = SLOW * np.array([joint.limits.velocity for joint in robot.joints])
-    result: Floats = (np.abs(qd) < limit).mean(axis=0)
+    result: Array = (np.abs(qd) < limit).mean(axis=0)
     return result
 
 
@@ -99,8 +99,8 @@ def slow_share(robot: RobotConfig, qd: Floats) -> Floats:
 class PointToPoint:
     """Candidate: waypoints (K, n), rad or m, and paces (K,), durations over the shortest possible ones."""
 
-    points: Floats
-    paces: Floats
+    points: Array
+    paces: Array
 
 
 class PointToPointSearch:
@@ -115,7 +115,7 @@ class PointToPointSearch:
         robot: RobotConfig,
         model: ArmModel,
         duration: float,
-        sigma: Floats,
+        sigma: Array,
         margin: float,
         theta: ArrayLike | None,
         aim: EffectObjective | None,
@@ -138,7 +138,7 @@ class PointToPointSearch:
     def random(self) -> PointToPoint:
         """Return random waypoints within `REACH` of each other, as many as fit the duration; the last one is home."""
         reach = self.rng.uniform(*REACH) * (self.high - self.low) if self.aim is None else None
-        points: list[Floats] = []
+        points: list[Array] = []
         paces: list[float] = []
         here, left = self.home, self.duration
         while True:
@@ -154,17 +154,17 @@ class PointToPointSearch:
         points[-1] = self.home
         return PointToPoint(np.array(points), np.array(paces))
 
-    def _waypoint(self, here: Floats, way: Floats) -> Floats:
+    def _waypoint(self, here: Array, way: Array) -> Array:
         """Return a random waypoint (n,), if possible one that a straight move in joint space reaches freely."""
         for _ in range(TRIES):
-            point: Floats = np.clip(here + self.rng.uniform(-way, way), self.low, self.high)
+            point: Array = np.clip(here + self.rng.uniform(-way, way), self.low, self.high)
             if self.collision is None:
                 break
             if self.collision.shortfall(np.linspace(here, point, MOVE_SAMPLES)) == 0.0:
                 break
         return point
 
-    def _free_home(self, home: Floats) -> Floats:
+    def _free_home(self, home: Array) -> Array:
         """Return the free posture (n,) nearest to ``home`` of some random ones; it depends on no seed."""
         collision = self.collision
         if collision is None or collision.shortfall(home[None]) == 0.0:
@@ -180,10 +180,10 @@ class PointToPointSearch:
             "Check collision.radius, capsules and boxes"
         )
 
-    def _far(self) -> Floats:
+    def _far(self) -> Array:
         """Return the reach (n,) of one move, drawn for each joint, so that single joints may move alone."""
         share = np.exp(self.rng.uniform(np.log(AIM_REACH[0]), np.log(AIM_REACH[1]), self.low.size))
-        far: Floats = share * (self.high - self.low)
+        far: Array = share * (self.high - self.low)
         return far
 
     def neighbour(self, candidate: PointToPoint) -> PointToPoint:
@@ -234,7 +234,7 @@ class PointToPointSearch:
         missing = self.collision.shortfall(trajectory.sample(1.0 / COLLISION_RATE))
         return Rank(violation + missing / MISS_UNIT, cost)
 
-    def _cost(self, q: Floats, qd: Floats, qdd: Floats, period: float) -> float:
+    def _cost(self, q: Array, qd: Array, qdd: Array, period: float) -> float:
         """Return the mean log standard deviation with penalties for conditioning and slowness; infinite if singular."""
         if self.aim is None:
             x = weighted_rows(self.model.base_regressor(q, qd, qdd, dt=period), self.sigma)
@@ -244,7 +244,7 @@ class PointToPointSearch:
         base = self._base_cost(x, qd, slow=False)
         return base if np.isinf(base) else self.aim.cost(motion, x, decimation, sigma) + BASE_WEIGHT * base
 
-    def _base_cost(self, x: Floats, qd: Floats, *, slow: bool) -> float:
+    def _base_cost(self, x: Array, qd: Array, *, slow: bool) -> float:
         """Return the cost of the base parameters from their weighted regressor (R, b)."""
         eigenvalues = np.linalg.eigvalsh(x.T @ x)
         if not eigenvalues[0] > 0.0:
@@ -253,28 +253,28 @@ class PointToPointSearch:
         slowness = np.maximum(0.0, slow_share(self.model.robot, qd) - SLOW_SHARE).sum() if slow else 0.0
         return float(-0.5 * np.log(eigenvalues).mean() + max(0.0, np.log(condition / CONDITION)) + slowness)
 
-    def _pace(self, count: int) -> Floats:
+    def _pace(self, count: int) -> Array:
         """Return paces (count,): uniform, or log-uniform in a design for an effect."""
         if self.aim is None:
             return self.rng.uniform(1.0, SLOWEST_PACE, count)
         return np.exp(self.rng.uniform(0.0, np.log(AIM_SLOWEST_PACE), count))
 
-    def _durations(self, candidate: PointToPoint) -> Floats:
+    def _durations(self, candidate: PointToPoint) -> Array:
         lengths = np.diff(np.vstack([self.home, candidate.points]), axis=0)
         wanted = np.maximum(self._shortest(lengths), SHORTEST_MOVE) * candidate.paces
-        result: Floats = wanted * self.duration / wanted.sum()
+        result: Array = wanted * self.duration / wanted.sum()
         return result
 
-    def _shortest(self, lengths: Floats) -> Floats:
+    def _shortest(self, lengths: Array) -> Array:
         by_velocity = np.abs(lengths) * PEAK_VELOCITY / self.velocity
         by_acceleration = np.sqrt(np.abs(lengths) * PEAK_ACCELERATION / self.acceleration)
-        result: Floats = np.maximum(by_velocity, by_acceleration).max(axis=1)
+        result: Array = np.maximum(by_velocity, by_acceleration).max(axis=1)
         return result
 
 
 def equations_of(
-    model: ArmModel, motion: Motion, decimation: Decimation, sigma: Floats
-) -> tuple[Floats, Decimation, Floats]:
+    model: ArmModel, motion: Motion, decimation: Decimation, sigma: Array
+) -> tuple[Array, Decimation, Array]:
     """Return the arguments of `EffectObjective.cost`: weighted base regressor (R, b), decimation and noise."""
     kept = decimation.instants(motion.samples)
     x = model.rigid_regressor(motion.q[kept], motion.qd[kept], motion.qdd[kept])
@@ -283,7 +283,7 @@ def equations_of(
     return weighted_rows(x, sigma), decimation, sigma
 
 
-def predicted_torque(model: ArmModel, theta: ArrayLike, q: Floats, qd: Floats, qdd: Floats, period: float) -> Floats:
+def predicted_torque(model: ArmModel, theta: ArrayLike, q: Array, qd: Array, qdd: Array, period: float) -> Array:
     """Return the joint torques along a motion with those of the model's terms, (N, n), N m or N."""
     torque = model.inverse_dynamics(theta, q, qd, qdd)
     if model.terms:
@@ -291,17 +291,17 @@ def predicted_torque(model: ArmModel, theta: ArrayLike, q: Floats, qd: Floats, q
     return torque
 
 
-def torque_deviation(model: ArmModel, covariance: Floats, q: Floats, qd: Floats, qdd: Floats, period: float) -> Floats:
+def torque_deviation(model: ArmModel, covariance: Array, q: Array, qd: Array, qdd: Array, period: float) -> Array:
     """Return the standard deviations (N, n) of torques predicted along a motion, N m or N.
 
     ``model``: anchored where terms depend on its torques; ``covariance`` (b, b): of its base parameters.
     """
     x = model.base_regressor(q, qd, qdd, dt=period)
-    result: Floats = np.sqrt(np.maximum(np.einsum("kjb,kjb->kj", x @ covariance, x), 0.0))
+    result: Array = np.sqrt(np.maximum(np.einsum("kjb,kjb->kj", x @ covariance, x), 0.0))
     return result
 
 
-def sample_trajectory(trajectory: Trajectory, period: float) -> tuple[Floats, Floats, Floats]:
+def sample_trajectory(trajectory: Trajectory, period: float) -> tuple[Array, Array, Array]:
     """Return positions, velocities and accelerations (N, n) along a trajectory by finite differences."""
     q = trajectory.sample(period)
     qd = np.gradient(q, period, axis=0)

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
@@ -22,8 +22,8 @@ FREQUENCIES = 4096
 class PreviousEstimate:
     """Earlier base parameters (b,) and torque noise (n,) below the cut-off of the regression, N m or N."""
 
-    theta: NDArray[np.float64]
-    noise: NDArray[np.float64]
+    theta: Array
+    noise: Array
 
 
 def previous_estimate(document: IdentificationDocument, robot: RobotConfig, where: str) -> PreviousEstimate:
@@ -49,11 +49,7 @@ def previous_estimate(document: IdentificationDocument, robot: RobotConfig, wher
 
 
 def physical_estimate(document: IdentificationDocument, robot: RobotConfig, where: str) -> PreviousEstimate:
-    """Return the estimate of `previous_estimate` with parameters that an arm can have: others predict wrong torques.
-
-    They are the nearest physically consistent ones where the document has them. Raises DataError if the identification
-    is unusable, or friction, rotor inertias or mass matrix are impossible by more than their uncertainty.
-    """
+    """Return the estimate of `previous_estimate` with parameters that an arm can have: others predict wrong torques."""
     found = previous_estimate(document, robot, where)
     without = "Next: identify the arm from a better recording, or design without --known"
     if document.verdict == "unusable":

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.loading import load_inertials, load_shapes
 from armident.configs.urdf_inertials import UrdfInertials
@@ -16,7 +17,6 @@ from armident.identify.excitation.collision import CollisionModel
 from armident.identify.excitation.design import ASSUMED_NOISE, PERIOD, Design, excesses, predict_precision
 from armident.identify.excitation.link_geometry import capsules_of
 from armident.identify.excitation.previous_estimate import PreviousEstimate
-from armident.identify.robot.chain import Floats
 
 NO_GEOMETRY = "give collision.radius or collision.capsules in the robot configuration, or a URDF with shapes"
 NO_BOXES = "list what stands around it in collision.boxes of the robot configuration"
@@ -27,7 +27,7 @@ class SafetyModel:
     """Masses (parameters (b,) or (p,), ``None`` if unknown) and bodies of an arm; ``remarks``: not checkable."""
 
     collision: CollisionModel
-    theta: Floats | None
+    theta: Array | None
     torque_source: str
     remarks: tuple[str, ...]
 
@@ -47,10 +47,7 @@ def safety_model(
     prior_name: str = "--known",
     masses: Path | None = None,
 ) -> SafetyModel:
-    """Collect masses and bodies of an arm: of an earlier estimate, of a file, of its configuration, of its URDF.
-
-    ``masses``: file of standard parameters from ``armident robot --truth``; replaces the masses of the URDF.
-    """
+    """Collect masses and bodies of an arm: of an earlier estimate, of a file, of its configuration, of its URDF."""
     shapes = None if source is None else load_shapes(source)
     capsules, unread = ([], []) if shapes is None else capsules_of(shapes.shapes)
     collision = CollisionModel(robot, capsules)
@@ -76,7 +73,7 @@ def safety_model(
     return SafetyModel(collision, theta, "the masses of the URDF", tuple(remarks))
 
 
-def _theta_of_urdf(robot: RobotConfig, found: UrdfInertials) -> Floats | None:
+def _theta_of_urdf(robot: RobotConfig, found: UrdfInertials) -> Array | None:
     """Standard parameters (p,) of the masses and friction of a URDF; ``None`` if it has no masses."""
     if len(found.massless) == robot.n:
         return None
@@ -84,7 +81,7 @@ def _theta_of_urdf(robot: RobotConfig, found: UrdfInertials) -> Floats | None:
     return np.array([values.get(name, 0.0) for name in arm_model(robot).names])
 
 
-def _theta_of_file(robot: RobotConfig, file: Path) -> tuple[Floats, list[str]]:
+def _theta_of_file(robot: RobotConfig, file: Path) -> tuple[Array, list[str]]:
     """Return the standard parameters (p,) of a JSON file, and the names of those that it lacks, which are zero."""
     values = read_json(file)
     names = arm_model(robot).names
@@ -148,7 +145,7 @@ class CheckedTrajectory:
     robot: RobotConfig
     path: Path | None
     design: Design
-    std: Floats
+    std: Array
     prior: PreviousEstimate | None
     safety: SafetyModel
     checks: SafetyChecks
@@ -171,7 +168,7 @@ def checked_trajectory(
     )
 
 
-def expected_std(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> Floats:
+def expected_std(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> Array:
     """Return predicted standard deviations of the base parameters (b,); of an assumed noise without ``prior``."""
     std = design.std
     if prior is None or std is None:
@@ -180,7 +177,7 @@ def expected_std(robot: RobotConfig, design: Design, prior: PreviousEstimate | N
     return std
 
 
-def assumed_noise(robot: RobotConfig) -> Floats:
+def assumed_noise(robot: RobotConfig) -> Array:
     """Return the torque noise (n,) that is assumed where none is known, N m or N."""
     return ASSUMED_NOISE * np.array([joint.limits.torque for joint in robot.joints])
 

@@ -6,8 +6,8 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.identify.controller.crc import JointResponse, identify_crc
 from armident.identify.controller.nominal import known_controller, nominal_controller, saturation
@@ -39,8 +39,6 @@ NOT_LIKE_THE_ROBOT = (
     "The identified controller does not move the simulated arm like the robot. A stiff PD controller is used."
 )
 
-Array = NDArray[np.float64]
-
 
 class ClosedLoop(NamedTuple):
     """The simulated closed loop of an estimator, first theta (b,), and why a preferred controller was not used.
@@ -62,11 +60,7 @@ def closed_loop(
     bandwidth: float,
     excluded: str | None = None,
 ) -> ClosedLoop:
-    """Return the first closed loop whose simulation runs and moves like the robot (thesis 5.2).
-
-    The identified or known controller comes before a stiff PD controller, IDIM-LS (b,) before the initial parameters.
-    Raises DataError if all diverge and the method has no measured regressor.
-    """
+    """Return the first closed loop whose simulation runs and moves like the robot (thesis 5.2)."""
     model, experiments, signals = prepared.model, prepared.experiments, prepared.signals
     dt = experiments[0].dt
     starts = [("idim-ls", ls), ("initial_parameters", initial_parameters(model))]
@@ -120,10 +114,7 @@ def closed_loop(
 
 
 def _bandpassed(options: Options, bandwidth: float, dt: float) -> Callable[[Array, int], Derivatives] | None:
-    """The bandpass of the measured positions, for the instruments; ``None`` where another filter was chosen.
-
-    Other instruments have frequencies that the regressor lacks; the prefilter of IDIM-PIV takes them for information.
-    """
+    """The bandpass of the measured positions, for the instruments; ``None`` where another filter was chosen."""
     if options.derivatives != "bandpass" or not estimator(options.method).measured:
         return None
     return lambda q, _: differentiate(q, dt, "bandpass", bandwidth_hz=bandwidth)

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs.schema.robot import Preprocessing
 from armident.identify.regression.equations import ExperimentEquations, filtered_regressor
 from armident.identify.robot.arm import ArmModel
@@ -41,10 +41,7 @@ def decimated_rows(decimation: Decimation, samples: Sequence[int]) -> int:
 
 
 def sufficient(decimation: Decimation, dt: float, samples: Sequence[int], rows: int) -> Decimation:
-    """Return the decimation or, where it leaves fewer than ``rows`` instants, the strongest one that leaves enough.
-
-    A higher cut-off only admits noise, which the estimator averages; too few equations determine nothing.
-    """
+    """Return the decimation or, where it leaves fewer than ``rows`` instants, the strongest one that leaves enough."""
     if decimated_rows(decimation, samples) >= rows:
         return decimation
     low, high = 1, decimation.factor
@@ -59,7 +56,7 @@ def sufficient(decimation: Decimation, dt: float, samples: Sequence[int], rows: 
     return found
 
 
-def aligned_torque(tau: NDArray[np.float64], late: float = 0.0) -> NDArray[np.float64]:
+def aligned_torque(tau: Array, late: float = 0.0) -> Array:
     """Mean of the torques (N, n) held before and after each position sample; ``late`` ones, samples, are interpolated.
 
     Sample k is held over ``[k, k + 1)``, so the torque as recorded belongs half a period after the position.
@@ -75,10 +72,7 @@ def aligned_torque(tau: NDArray[np.float64], late: float = 0.0) -> NDArray[np.fl
 def equations(
     model: ArmModel, experiments: Sequence[Experiment], signals: Sequence[Derivatives], decimation: Decimation
 ) -> Sequence[ExperimentEquations]:
-    """Filtered and decimated equations of every experiment, without rows slower than a ``velocity_threshold``.
-
-    Without one all samples stay, as a linear filter requires: the sign of the velocity is smoothed.
-    """
+    """Filtered and decimated equations of every experiment, without rows slower than a ``velocity_threshold``."""
     threshold = model.robot.friction.velocity_threshold
 
     def of(experiment: Experiment, s: Derivatives) -> ExperimentEquations:

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError, Joint, RobotConfig
 from armident.configs.schema.limits import ENDLESS
 from armident.daq.recording import Recording, Stream
@@ -32,8 +33,6 @@ gives ten samples per period of the motion. Longer gaps separate pieces."""
 PIECE = 1_000_000
 """Number of samples whose references are looked up at a time."""
 EFFORTS: tuple[Literal["torque", "current", "voltage"], ...] = ("torque", "current", "voltage")
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -130,10 +129,7 @@ def _converted(
 def experiments_of(
     recordings: Sequence[Recording], robot: RobotConfig, *, name_files: bool, stretches: StretchRule = WHOLE
 ) -> tuple[Sequence[Experiment], list[str]]:
-    """Experiments of recordings in order, and remarks, which begin with the file if ``name_files``.
-
-    Raises ConfigError if a recording is of another robot, DataError if one holds no experiment that can be used.
-    """
+    """Experiments of recordings in order, and remarks, which begin with the file if ``name_files``."""
     found: list[Sequence[Experiment]] = []
     notes: list[str] = []
     if sum(recording.samples.sync.size for recording in recordings) * robot.n > stretches.beyond:
@@ -242,10 +238,7 @@ def joint_positions(stream: Stream, quantity: Literal["position", "demand", "vel
 
 
 def joint_torques(stream: Stream, robot: RobotConfig) -> Array:
-    """Joint torques from the signals of the drives, shape (N, n), N m or N; DataError if missing or not finite.
-
-    Current and voltage belong to the motor, independently of the side of the positions; a torque names its side.
-    """
+    """Joint torques from the signals of the drives, shape (N, n), N m or N; DataError if missing or not finite."""
     wanted = robot.joints[0].drive.signal
     for quantity in sorted(EFFORTS, key=lambda effort: effort != wanted):
         name = stream.named(quantity)
@@ -403,10 +396,7 @@ def rest_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[st
 
 
 def _rate_notes(recording: Recording) -> list[str]:
-    """Notes on a SYNC rate that differs from the nominal one by the receive times.
-
-    Whole periods that the producer skipped and counted are no clock error, but matter where a real arm moves on.
-    """
+    """Notes on a SYNC rate that differs from the nominal one by the receive times."""
     samples, nominal = recording.samples, recording.sample_rate_hz
     elapsed = float(samples.t_ns[-1] - samples.t_ns[0]) * 1e-9
     if elapsed <= 0:

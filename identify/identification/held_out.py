@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from armident.arrays import Array
 from armident.identify.regression.equations import ExperimentEquations
-
-Array = NDArray[np.float64]
 
 FOLDS = 5
 """Number of parts, each one stretch of time of every experiment: a fit to four fifths of the data has standard

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.estimators.diagnostics import Diagnostics
 from armident.identify.identification.equations import Prepared
@@ -22,8 +23,6 @@ from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import ConsistentParameters
 from armident.identify.signals.decimate import Decimation
-
-Array = NDArray[np.float64]
 
 WORTHLESS_PCT = 100.0
 """Relative torque error, percent, of parameters that are all zero."""

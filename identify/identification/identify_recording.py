@@ -40,11 +40,7 @@ def identify_recording(
     check: Callable[[Sequence[Experiment], RobotConfig], SetupCheck] | None = check_setup,
     stretches: StretchRule | None = None,
 ) -> IdentificationOutcome:
-    """Identify recordings of one robot, read from files or assembled from the stream.
-
-    ``robot``: default that of the first recording. ``progress`` takes stage and share done, 0 to 1; findings of
-    ``check`` enter the verdict. Raises ConfigError or DataError if the request is not supported.
-    """
+    """Identify recordings of one robot, read from files or assembled from the stream."""
     recordings = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
     robot = robot or recordings[0].robot
     experiments, notes = experiments_of(

@@ -58,10 +58,7 @@ def require_finite(estimate: Estimate) -> None:
 def refusing_singular(
     method: Method, model: ArmModel, support: Support, criteria: IdentificationCriteria
 ) -> Iterator[None]:
-    """Turn equations without a finite solution into a `DataError` that lists what the motion supports.
-
-    Floating-point warnings are suppressed. Scipy reports numbers that are not finite as ``ValueError``.
-    """
+    """Turn equations without a finite solution into a `DataError` that lists what the motion supports."""
     try:
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", linalg.LinAlgWarning)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.identification.equations import Prepared
 from armident.identify.regression.equations import ExperimentEquations, instants, residuals
 
@@ -27,8 +28,6 @@ TOGETHER = 200_000
 
 LEAST_SHIFT = 0.05
 """Least shift, as share of the length of an experiment."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

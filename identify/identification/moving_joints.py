@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array, Mask
 from armident.configs import DataError, RobotConfig
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.signals.differentiate import encoder_resolution
@@ -18,9 +18,6 @@ FARTHEST = 1e3
 """Position limit, rad or m, beyond which a joint counts as endless and its recorded range is used."""
 
 MOVE = "move every joint over more of its range, at several speeds: armident trajectory --config ROBOT --out TRAJECTORY"
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 def joint_ranges(experiments: Sequence[Experiment]) -> Array:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.effects.effect import Effect, Place
 from armident.identify.effects.free_shapes import hats
 from armident.identify.effects.registry import catalogue
@@ -25,8 +26,6 @@ from armident.identify.regression.equations import (
 )
 from armident.identify.regression.orders import MAX_AR_ORDER
 from armident.identify.regression.whitening import whitened
-
-Array = NDArray[np.float64]
 
 POSITION_KNOTS = 9
 """Knots of the functions of position over its range: a period of an eighth of the range is still visible."""
@@ -84,10 +83,7 @@ class EffectDirection:
 def residual_statistics(
     prepared: Prepared, blocks: Sequence[ExperimentEquations], estimate: Estimate
 ) -> tuple[tuple[JointResidualStatistics, ...], tuple[EffectDirection, ...]]:
-    """Statistics of the residuals of every joint; the noise models of the estimate weigh them, else fitted ones.
-
-    Then the directions of changes for which the model has no parameter.
-    """
+    """Statistics of the residuals of every joint; the noise models of the estimate weigh them, else fitted ones."""
     noise: Sequence[ArModel] = estimate.noise
     if not any(ar.order for ar in noise):
         noise = noise_models(blocks, estimate.theta, estimate.covariance, MAX_AR_ORDER)
@@ -141,10 +137,7 @@ def effect_columns(
     theta: Array,
     effects: Sequence[tuple[Effect, Place]],
 ) -> list[Array]:
-    """Columns (M, n, m) of effects in each experiment at some samples; ``theta`` (b,) predicts their torques.
-
-    They vary as slowly as the motion, so that the filter of the equations leaves them.
-    """
+    """Columns (M, n, m) of effects in each experiment at some samples; ``theta`` (b,) predicts their torques."""
     columns = []
     for e, s, at in zip(prepared.experiments, prepared.signals, numbers, strict=True):
         motion = replace(prepared.model.motion(s.q[at], s.qd[at], s.qdd[at], e.dt, e.start), theta=theta)

@@ -4,8 +4,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig, Trajectory, load_robot, load_trajectory
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.effects.terms import arm_model
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from armident.identify.robot.arm import ArmModel
     from armident.identify.robot.simulation import Simulation
 
-Array = NDArray[np.float64]
 
 IN_MEMORY = Path("(in memory)")
 """File of a model that comes from none, in messages."""

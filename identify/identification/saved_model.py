@@ -27,11 +27,7 @@ def load_model(
     default: RobotConfig | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> RobotModel:
-    """Read an identified model from ``identification.json``, ``diagnosis.json``, or the folder of one of them.
-
-    The structure that a diagnosis found is identified by IDIM-IV from its recordings. ``default``: robot of documents
-    without one. Raises ConfigError if a file is missing, DataError if it is unusable or of another robot.
-    """
+    """Read an identified model from ``identification.json``, ``diagnosis.json``, or the folder of one of them."""
     path = _file(path)
     if str(read_json(path).get("schema", "")).startswith("armident/diagnosis/"):
         return _diagnosed(path, robot, progress)

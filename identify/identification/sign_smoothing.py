@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 from scipy.special import chdtri
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.identification.equations import Prepared, tested
@@ -52,8 +52,6 @@ COVERAGE = 0.95
 
 DEPENDENT = 1e-8
 """Singular values of a joint's equations, relative to the largest, that count as rounding errors."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.identification.equations import Prepared, aligned_torque
 from armident.identify.identification.identification_criteria import IdentificationCriteria
@@ -52,8 +52,6 @@ SIGNIFICANCE = 0.05
 
 FEW, MANY = 2, 12
 """Simulated recordings to see that the bias is irrelevant, and to measure a relevant one."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

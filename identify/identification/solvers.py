@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.diagnostics import Diagnostics, diagnose_estimate
 from armident.identify.estimators.methods import Method, estimator
@@ -50,8 +51,6 @@ NOT_FINITE = "infs or NaNs"
 FEW_LAGS = 5
 """Lags of the test for serial correlation: the correlation that widens intervals is that of near neighbours."""
 
-Array = NDArray[np.float64]
-
 
 def decimation_of(
     method: Method,
@@ -64,11 +63,7 @@ def decimation_of(
     warnings: list[str] | None = None,
     reasons: list[Reason] | None = None,
 ) -> Decimation:
-    """Low-pass and decimation of a method, rough for one with a noise model; a chosen ``factor`` is kept.
-
-    Else at least ``rows`` equations are left (`least_rows`). A line is added to ``warnings`` if the cut-off was raised,
-    to ``reasons`` if too few equations are left.
-    """
+    """Low-pass and decimation of a method, rough for one with a noise model; a chosen ``factor`` is kept."""
     share = PIV_CUTOFF if estimator(method).prefiltered else LS_CUTOFF
     cutoff = share * bandwidth_hz if factor is None else 0.5 / (dt * factor)
     wanted = design(dt, cutoff, factor)

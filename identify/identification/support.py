@@ -4,9 +4,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
+from armident.arrays import Array, Mask
 from armident.identify.identification.equations import Prepared
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.identification_result import units
@@ -29,9 +29,6 @@ motion cannot separate at all, rounding would decide."""
 
 NON_NEGATIVE = ("fv", "fc", "ia")
 """First letters of the parameters that cannot be negative: viscous and Coulomb friction, rotor inertia."""
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.regression.ar_noise import WHITE, ArModel
 from armident.identify.regression.equations import (
     ExperimentEquations,
@@ -37,8 +38,6 @@ REWEIGHTINGS = 2
 """Weighted fits after the first, unweighted one: the delay is linear in the last theta, which hardly changes."""
 
 _CHUNK_SAMPLES = 32768
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

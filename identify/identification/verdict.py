@@ -42,10 +42,7 @@ def judge(reasons: Sequence[Reason], setup: SetupCheck | None = None) -> Verdict
 
 
 def _merged(reasons: Sequence[Reason], setup: SetupCheck | None) -> list[Reason]:
-    """Reasons of the set-up and of the result, each defect once.
-
-    Rest belongs to the excitation, a common delay to the set-up, and unexplained joints to the reason with their error.
-    """
+    """Reasons of the set-up and of the result, each defect once."""
     if setup is None:
         return list(reasons)
     kinds = {reason.kind for reason in reasons}

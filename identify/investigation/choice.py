@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.configs import ConfigError, RobotConfig, Trajectory
 from armident.daq.recording import Recording
 from armident.identify.diagnosis.model_state import ModelState
@@ -23,7 +24,6 @@ from armident.identify.identification.from_recording import experiments_of
 from armident.identify.investigation.motions import FAMILIES, MARGIN, Reach, reach_of
 from armident.identify.investigation.question import Question, question
 from armident.identify.investigation.rivals import rivals_of, uncertain
-from armident.identify.robot.chain import Floats
 
 EXCITATION = "fast_excitation"
 """Name of the motion of all joints that is designed for the parameters of the model."""
@@ -83,11 +83,7 @@ def next_motion(
     done: Sequence[MotionChoice],
     left_s: float,
 ) -> Chosen:
-    """Return the motion that tells the explanations apart most per second of robot time, among those not done yet.
-
-    ``state``: model as configured, fitted to all recordings so far. ``explanations``: of its joints. ``left_s``: time
-    of motion that is left, s.
-    """
+    """Return the motion that tells the explanations apart most per second of robot time, among those not done yet."""
     reach, past = reach_of_recordings(state), {_key(one) for one in done}
     open_questions, asked = _questions(state, explanations)
     made: list[tuple[float, MotionChoice, Trajectory]] = []
@@ -117,10 +113,7 @@ def next_motion(
 def next_recording(
     state: ModelState, explanations: Sequence[Explanation], offered: Sequence[Recording], done: Sequence[MotionChoice]
 ) -> Chosen:
-    """Return the recording of the past that tells the explanations apart most, among those not seen yet.
-
-    Its torques are not looked at before it is chosen.
-    """
+    """Return the recording of the past that tells the explanations apart most, among those not seen yet."""
     open_questions, asked = _questions(state, explanations)
     past = {one.words for one in done}
     made: list[tuple[MotionChoice, Recording]] = []
@@ -156,14 +149,11 @@ def too_long(choice: MotionChoice, left_s: float) -> str | None:
 def excluded(
     robot: RobotConfig,
     trajectory: Trajectory,
-    theta: Floats | None,
+    theta: Array | None,
     collision: CollisionModel,
-    covariance: Floats | None = None,
+    covariance: Array | None = None,
 ) -> str | None:
-    """Return the limit that a motion violates, in words.
-
-    ``theta`` (b,) predicts its torques, with the uncertainty that follows from its ``covariance`` (b, b).
-    """
+    """Return the limit that a motion violates, in words."""
     try:
         trajectory.check(robot, "motion")
     except ConfigError as error:
@@ -211,7 +201,7 @@ def _of_joint(state: ModelState, reach: Reach, name: str) -> Iterator[tuple[Moti
 def excitation_of(
     robot: RobotConfig,
     reach: Reach,
-    theta: Floats | None,
+    theta: Array | None,
     collision: CollisionModel,
     duration: float = EXCITATION_S,
     seed: int = 0,
@@ -251,7 +241,7 @@ def reach_of_recordings(state: ModelState) -> Reach:
     return reach_of(state.robot, np.round(first, 4), speeds, accelerations)
 
 
-def home_of(robot: RobotConfig) -> Floats:
+def home_of(robot: RobotConfig) -> Array:
     """Return the posture (n,) at which motions begin: zero, or the nearest one within the limits."""
     bounds = np.array([joint.limits.position for joint in robot.joints])
     return np.clip(np.zeros(robot.n), bounds[:, 0], bounds[:, 1])

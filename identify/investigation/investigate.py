@@ -227,10 +227,7 @@ def started(
     folder: Path | None,
     baseline: IdentificationDocument | None = None,
 ) -> Investigating:
-    """Return a new investigation. Raises ConfigError if the folder has one that has begun, or a limit is not positive.
-
-    An investigation without a motion and without a diagnosis has not begun.
-    """
+    """Return a new investigation; ConfigError if one has begun in the folder, or a limit is not positive."""
     if experiments < 1 or not minutes > 0.0:
         raise ConfigError("--experiments and --minutes: expected at least one motion and a time greater than 0")
     robot.check_movable("investigate")

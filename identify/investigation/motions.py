@@ -7,9 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.configs import RobotConfig, Trajectory
 from armident.configs.schema.trajectory import Move
-from armident.identify.robot.chain import Floats
 
 MARGIN = 0.9
 """Usable share of each limit."""
@@ -29,29 +29,26 @@ SHORTEST = 0.05
 class Reach:
     """Limits of designed motions and the posture where they begin and end, (n,) each; SI, joint side."""
 
-    low: Floats
-    high: Floats
-    velocity: Floats
-    acceleration: Floats
-    home: Floats
+    low: Array
+    high: Array
+    velocity: Array
+    acceleration: Array
+    home: Array
 
     @property
-    def range(self) -> Floats:
+    def range(self) -> Array:
         """Usable range of each joint, rad or m, (n,)."""
         return np.asarray(self.high - self.low)
 
 
-def reach_of(robot: RobotConfig, home: Floats, speeds: Floats, accelerations: Floats) -> Reach:
-    """Return the limits of motions of an arm whose recordings reach ``speeds`` and ``accelerations`` (n,) so far.
-
-    A motion is at most `FASTER` than they are, and a joint that never moved uses `FIRST_CONTACT` of its limits.
-    """
+def reach_of(robot: RobotConfig, home: Array, speeds: Array, accelerations: Array) -> Reach:
+    """Return the limits of motions of an arm whose recordings reach ``speeds`` and ``accelerations`` (n,) so far."""
     limits = [joint.limits for joint in robot.joints]
     bounds = np.array([limit.position for limit in limits])
     middle, half = bounds.mean(axis=1), 0.5 * (bounds[:, 1] - bounds[:, 0])
     low, high = middle - MARGIN * half, middle + MARGIN * half
 
-    def allowed(most: Floats, seen: Floats) -> Floats:
+    def allowed(most: Array, seen: Array) -> Array:
         return np.minimum(MARGIN * most, np.maximum(FIRST_CONTACT * most, FASTER * seen))
 
     velocity = allowed(np.array([limit.velocity for limit in limits]), speeds)
@@ -69,7 +66,7 @@ class Path:
     def __post_init__(self) -> None:
         self.at = self.reach.home.copy()
 
-    def to(self, point: Floats, speed: float = 1.0, dwell: float = 0.0) -> None:
+    def to(self, point: Array, speed: float = 1.0, dwell: float = 0.0) -> None:
         """Move to a posture (n,) at a share of the allowed speed, and rest."""
         point = np.clip(point, self.reach.low, self.reach.high)
         length = np.abs(point - self.at)

@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.configs import Trajectory
 from armident.identify.diagnosis.excess import about_reversals
 from armident.identify.diagnosis.model_state import ModelState
@@ -19,7 +20,6 @@ from armident.identify.diagnosis.stretch import moving_rows
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.investigation.rivals import Rival
 from armident.identify.regression.whitening import whitened
-from armident.identify.robot.chain import Floats
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.differentiate import differentiate
 from armident.identify.signals.experiments import Experiment
@@ -42,10 +42,10 @@ class Question:
     state: ModelState
     rivals: tuple[Rival, ...]
     columns: tuple[slice, ...]
-    information: Floats
+    information: Array
 
     @property
-    def probabilities(self) -> Floats:
+    def probabilities(self) -> Array:
         """Probabilities of the rivals, whose sum is one."""
         p = np.array([one.probability for one in self.rivals])
         return np.asarray(p / p.sum())
@@ -61,7 +61,7 @@ class Question:
         rows = np.arange(0, experiment.q.shape[0], max(1, round(study.dt / experiment.dt)))
         return self._gain(signals.q[rows], signals.qd[rows], signals.qdd[rows])
 
-    def _gain(self, q: Floats, qd: Floats, qdd: Floats) -> float:
+    def _gain(self, q: Array, qd: Array, qdd: Array) -> float:
         study = self.state.study
         duration = max(study.duration, study.dt * q.shape[0])
         motion = Motion(study.model, q, qd, qdd, study.dt, 0.0, self.state.fit.theta, duration)
@@ -82,7 +82,7 @@ class Question:
                 apart[one] = apart[:, one]
         return float(-(p * np.log(np.exp(-np.clip(apart, 0.0, MOST)) @ p)).sum())
 
-    def _apart(self, information: Floats, one: int, other: int) -> float:
+    def _apart(self, information: Array, one: int, other: int) -> float:
         """Expected log Bayes factor of one rival over another, if the first one is right, nats."""
         values = self.rivals[one].values
         assert values is not None
@@ -123,14 +123,11 @@ def _pieces(motion: Motion) -> Iterator[Motion]:
         yield replace(motion, q=q, qd=qd, qdd=qdd, start=motion.start + motion.dt * float(begin))
 
 
-def _information(state: ModelState, rivals: Sequence[Rival], motions: Sequence[Motion]) -> Floats:
-    """Return the information (c, c) of motions on the parameters of the model and of all rivals.
-
-    Times about reversals, where no model of dry friction is right, count only for effects that act there.
-    """
+def _information(state: ModelState, rivals: Sequence[Rival], motions: Sequence[Motion]) -> Array:
+    """Return the information (c, c) of motions on the parameters of the model and of all rivals."""
     study = state.study
     slowest, factor = 1.0 / np.asarray(state.robot.sign_smoothing), study.decimation.factor
-    total: Floats | float = 0.0
+    total: Array | float = 0.0
     pieces = [(piece, ~study.dragged(whole.qd)) for whole in motions for piece in _pieces(whole)]
     for motion, asked in pieces:
         parts = [study.model.rigid_regressor(motion.q, motion.qd, motion.qdd), study.model.term_regressor(motion)]

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes, candidates
 from armident.identify.diagnosis.model_state import ModelState, fitted_in_loop_of, with_entries
@@ -15,7 +16,6 @@ from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import Term, entry_of
 from armident.identify.effects.unnamed import NAME as UNNAMED
-from armident.identify.robot.chain import Floats
 from armident.identify.robot.motion import Motion
 
 LEAST = 0.02
@@ -36,9 +36,9 @@ class Rival:
     name: str
     probability: float
     term: Term | None = None
-    values: Floats | None = None
+    values: Array | None = None
 
-    def columns(self, motion: Motion) -> Floats:
+    def columns(self, motion: Motion) -> Array:
         """Return the torques of all joints per unit of each free parameter, (N, n, k + s).
 
         The first k are the linear parameters, the others first-order changes by each continuous nonlinear one.
@@ -57,11 +57,7 @@ class Rival:
 
 
 def rivals_of(state: ModelState, explanation: Explanation) -> list[Rival]:
-    """Return the explanations of a joint with their probabilities; the last one is that nothing is missing.
-
-    ``state``: model as configured, fitted to all recordings so far. What has no name is represented by those effects
-    that the data favour most; names that the recordings cannot show are left out.
-    """
+    """Return the explanations of a joint with their probabilities; the last one is that nothing is missing."""
     joint = state.study.joints.index(explanation.joint)
     cache, fit = ColumnCache(state.study, state.fit.theta), state.fit.renoised(state.weights)
     best: dict[str, tuple[float, Candidate, Shapes]] = {}
@@ -99,10 +95,7 @@ def _fitted(
 
 
 def with_decided(state: ModelState, found: RobotConfig, explanations: Sequence[Explanation]) -> ModelState:
-    """Return the model with the effects that are decided: what is asked next stands beside them.
-
-    ``state``: model as configured. ``found``: configuration with what the diagnosis found.
-    """
+    """Return the model with the effects that are decided: what is asked next stands beside them."""
     decided = {(one.joint, one.likely[0]) for one in explanations if one.likely and not one.doubtful}
     sure = [e for e in found.effects if e not in state.robot.effects and (e.joint, e.effect) in decided]
     return (fitted_in_loop_of(state, with_entries(state.robot, sure)) if sure else None) or state

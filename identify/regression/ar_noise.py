@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import ARITHMETIC, compiled
 from armident.identify.regression.fir import filter_columns
 
@@ -20,7 +21,7 @@ PIECE = 4096
 class ArModel:
     """Noise model ``C(z^-1) xi = e`` with ``C = 1 + c_1 z^-1 + ...`` (6.19), ``e`` white; ``aic``: see (6.24)."""
 
-    coefficients: NDArray[np.float64]
+    coefficients: Array
     variance: float
     aic: float
 
@@ -30,12 +31,12 @@ class ArModel:
         return self.coefficients.size
 
     @property
-    def whitening(self) -> NDArray[np.float64]:
+    def whitening(self) -> Array:
         """Impulse response of the filter ``C(z^-1) / lambda``, shape (l + 1,)."""
-        response: NDArray[np.float64] = np.append(1.0, self.coefficients) / np.sqrt(self.variance)
+        response: Array = np.append(1.0, self.coefficients) / np.sqrt(self.variance)
         return response
 
-    def whiten(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def whiten(self, x: Array) -> Array:
         """``C(z^-1) x / lambda`` along the first axis, (M, ...) to (M - order, ...), without an initial state.
 
         Shape (0, ...) where there are no more samples than coefficients.
@@ -65,7 +66,7 @@ WHITE = ArModel(np.empty(0), 1.0, 0.0)
 class WhitenessTest:
     """Autocorrelation of residuals at lags 1..L, with the half width ``bound`` of the 2-sigma band of white noise."""
 
-    autocorrelation: NDArray[np.float64]
+    autocorrelation: Array
     bound: float
 
     @property
@@ -80,12 +81,12 @@ class WhitenessTest:
 
 
 def ar_models(
-    errors: Sequence[NDArray[np.float64]],
+    errors: Sequence[Array],
     max_order: int,
     *,
     keep: Sequence[NDArray[np.bool_]] | None = None,
     parameters: float = 0.0,
-    absorbed: Sequence[NDArray[np.float64]] | None = None,
+    absorbed: Sequence[Array] | None = None,
 ) -> list[ArModel]:
     """AR model of the errors (M, n) of each joint (2.25, 2.26, 6.21 to 6.25); order at most a tenth of the samples.
 
@@ -105,9 +106,7 @@ def ar_models(
     return [replace(ar, variance=ar.variance / free) for ar in models]
 
 
-def fit_ar(
-    series: Sequence[NDArray[np.float64]], max_order: int, absorbed: NDArray[np.float64] | None = None
-) -> ArModel:
+def fit_ar(series: Sequence[Array], max_order: int, absorbed: Array | None = None) -> ArModel:
     """AR model of residuals by Levinson-Durbin on the Yule-Walker equations, order by AIC (6.21 to 6.25).
 
     The order is at most a tenth of the samples. ``absorbed``: autocovariance sums, lags 0.., that parameters took out.
@@ -123,12 +122,12 @@ def fit_ar(
     return lowest_aic(r, total)
 
 
-def lowest_aic(r: NDArray[np.float64], samples: int) -> ArModel:
+def lowest_aic(r: Array, samples: int) -> ArModel:
     """AR model of the order with the lowest Akaike criterion (6.24, 6.25), from autocovariances ``r``, ``r[0] > 0``."""
     return ArModel(*_lowest_aic(r, samples))
 
 
-def fit_spectrum(power: NDArray[np.float64], order: int) -> ArModel:
+def fit_spectrum(power: Array, order: int) -> ArModel:
     """Stable AR model, of at most an order, whose ``variance / |C|^2`` follows a spectrum from zero to Nyquist."""
     r = np.fft.irfft(power)[: order + 1]
     coefficients, variances = levinson_durbin(r)
@@ -137,7 +136,7 @@ def fit_spectrum(power: NDArray[np.float64], order: int) -> ArModel:
 
 
 @compiled("f8[::1]", **ARITHMETIC)
-def levinson_durbin(r: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def levinson_durbin(r: Array) -> tuple[Array, Array]:
     """Yule-Walker coefficients (P + 1, L) and variances (P + 1,) of every order by Levinson-Durbin (6.21 to 6.23).
 
     ``r``: autocovariances at lags 0..L, ``r[0] > 0``. P is L, or less where a model of order P + 1 would be exact.
@@ -160,12 +159,12 @@ def levinson_durbin(r: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
     return coefficients, variances
 
 
-def lagged_sums(x: NDArray[np.float64], max_lag: int, first: int = 0) -> NDArray[np.float64]:
+def lagged_sums(x: Array, max_lag: int, first: int = 0) -> Array:
     """``sum_t x(t) . x(t - k)`` of ``x`` (M, m) for lags 0..max_lag, shape (max_lag + 1,)."""
     return _lagged_sums(np.ascontiguousarray(x, dtype=np.float64), max_lag, first)
 
 
-def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> WhitenessTest:
+def whiteness(series: Sequence[Array], lags: int = 20) -> WhitenessTest:
     """Autocorrelation of residuals pooled over experiments, with the bound ``2 / sqrt(M)``."""
     total = sum(s.size for s in series)
     mean = sum(float(s.sum()) for s in series) / total
@@ -178,7 +177,7 @@ def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whitenes
 
 
 @compiled("f8[::1], i8", **ARITHMETIC)
-def _lowest_aic(r: NDArray[np.float64], samples: int) -> tuple[NDArray[np.float64], float, float]:
+def _lowest_aic(r: Array, samples: int) -> tuple[Array, float, float]:
     """Coefficients, variance and criterion of the model with the lowest AIC."""
     coefficients, variances = levinson_durbin(r)
     best, lowest = 0, np.inf
@@ -190,7 +189,7 @@ def _lowest_aic(r: NDArray[np.float64], samples: int) -> tuple[NDArray[np.float6
 
 
 @compiled("f8[:, ::1], i8, i8", **ARITHMETIC)
-def _lagged_sums(x: NDArray[np.float64], max_lag: int, first: int) -> NDArray[np.float64]:
+def _lagged_sums(x: Array, max_lag: int, first: int) -> Array:
     samples, width = x.shape
     # The previous sample is the previous row of the array: one long sum per lag, in pieces that stay in the cache.
     flat, rows = x.ravel(), max(1, PIECE // width)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from armident.arrays import Array
 from armident.identify.regression.ar_noise import ArModel, ar_models, lagged_sums
 from armident.identify.regression.whitening import whitened, whitened_series
 from armident.identify.robot.arm import ArmModel
@@ -37,17 +38,17 @@ class ExperimentEquations:
     ``y`` (M, n): torques; ``x`` (M, n, b): regressor at measured signals; ``keep`` (M, n): equations to use.
     """
 
-    y: NDArray[np.float64]
-    x: NDArray[np.float64]
+    y: Array
+    x: Array
     keep: NDArray[np.bool_]
-    t: NDArray[np.float64]
+    t: Array
 
 
 @dataclass(frozen=True)
 class InstrumentedEquations(ExperimentEquations):
     """Equations of one experiment with instruments. ``z``: regressor at simulated signals, shape (M, n, b)."""
 
-    z: NDArray[np.float64]
+    z: Array
 
 
 @dataclass(frozen=True)
@@ -57,24 +58,24 @@ class Estimate:
     ``noise``: the sigma_j^2 of 2.25. ``residuals``: whitened, per joint and experiment, in standard deviations.
     """
 
-    theta: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    theta: Array
+    covariance: Array
     noise: tuple[ArModel, ...]
-    residuals: tuple[tuple[NDArray[np.float64], ...], ...]
+    residuals: tuple[tuple[Array, ...], ...]
     iterations: int = 1
     converged: bool = True
     stop_reason: str = "linear in the parameters: solved in one step"
     warnings: tuple[str, ...] = ()
 
     @property
-    def std(self) -> NDArray[np.float64]:
+    def std(self) -> Array:
         """Standard deviations, shape (b,)."""
         return np.sqrt(np.diag(self.covariance))
 
 
 def filtered_regressor(
     model: ArmModel, signals: Derivatives, decimation: Decimation, *, sharp_sign: bool = False
-) -> NDArray[np.float64]:
+) -> Array:
     """Base regressor (M, n, b) of signals (N, n) after the parallel filter; ``sharp_sign``: unsmoothed friction sign.
 
     Piece by piece on all processors: unfiltered rows stay in the cache. Terms depend on the past: they get all at once.
@@ -124,12 +125,8 @@ def filtered_regressor(
     return filtered
 
 
-def thinned_regressor(model: ArmModel, signals: Derivatives, decimation: Decimation) -> NDArray[np.float64]:
-    """`filtered_regressor` at as few samples as a motion without noise needs: for instruments, not for equations.
-
-    Dry friction has content beyond: it changes an instrument by percents where a joint turns round. Terms need all
-    samples.
-    """
+def thinned_regressor(model: ArmModel, signals: Derivatives, decimation: Decimation) -> Array:
+    """`filtered_regressor` at as few samples as a motion without noise needs: for instruments, not for equations."""
     if model.terms or decimation.every == 1:
         return filtered_regressor(model, signals, decimation)
     q, qd, qdd = (decimation.thin(x) for x in (signals.q, signals.qd, signals.qdd))
@@ -137,32 +134,28 @@ def thinned_regressor(model: ArmModel, signals: Derivatives, decimation: Decimat
     return filtered_regressor(model, few, decimation.of_thin)[: decimation.count(signals.q.shape[0])]
 
 
-def stacked(
-    blocks: Sequence[ExperimentEquations], noise: Sequence[ArModel]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def stacked(blocks: Sequence[ExperimentEquations], noise: Sequence[ArModel]) -> tuple[Array, Array]:
     """Regressor (rows, b) and torques (rows,) of 2.20 and 2.21, whitened, without the equations left out."""
     keep = [b.keep for b in blocks]
     return whitened(mapped(lambda b: b.x, blocks), noise, keep), whitened([b.y for b in blocks], noise, keep)
 
 
-def stacked_parts(
-    blocks: Iterable[ExperimentEquations], noise: Sequence[ArModel]
-) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def stacked_parts(blocks: Iterable[ExperimentEquations], noise: Sequence[ArModel]) -> Iterator[tuple[Array, Array]]:
     """Yield `stacked` of one experiment after the other: rows of a long recording are in memory one at a time."""
     for block in blocks:
         yield stacked([block], noise)
 
 
 def instrumented(
-    blocks: Sequence[ExperimentEquations], instruments: Sequence[NDArray[np.float64]]
+    blocks: Sequence[ExperimentEquations], instruments: Sequence[Array]
 ) -> Sequence[InstrumentedEquations]:
     """Equations with instruments: the regressor at simulated signals, (M, n, b) per experiment."""
     return mapped(lambda b, z: InstrumentedEquations(b.y, b.x, b.keep, b.t, z), blocks, instruments)
 
 
-def applied(columns: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def applied(columns: Array, values: Array) -> Array:
     """``columns @ values``, shape (M, n), as one product. ``columns``: shape (M, n, k); ``values``: shape (k,)."""
-    product: NDArray[np.float64] = (columns.reshape(-1, columns.shape[2]) @ values).reshape(columns.shape[:2])
+    product: Array = (columns.reshape(-1, columns.shape[2]) @ values).reshape(columns.shape[:2])
     return product
 
 
@@ -171,7 +164,7 @@ def instants(blocks: Sequence[ExperimentEquations], dt: float) -> list[NDArray[n
     return [np.rint(block.t / dt).astype(np.int64) for block in blocks]
 
 
-def residuals(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def residuals(blocks: Sequence[ExperimentEquations], theta: Array) -> list[Array]:
     """``tau - phi theta`` of each experiment, shape (M, n). ``theta``: base parameters, shape (b,)."""
     return [block.y - applied(block.x, theta) for block in blocks]
 
@@ -181,19 +174,19 @@ def residuals_of(estimate: Estimate, numbers: Sequence[int]) -> Estimate:
     return replace(estimate, residuals=tuple(tuple(series[k] for k in numbers) for series in estimate.residuals))
 
 
-def joint_variances(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[ArModel]:
+def joint_variances(blocks: Sequence[ExperimentEquations], theta: Array) -> list[ArModel]:
     """Serially uncorrelated noise with the residual variance of each joint (2.25, 2.26)."""
     return ar_models(residuals(blocks, theta), 0, keep=[b.keep for b in blocks], parameters=theta.size)
 
 
-def residual_norm(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64], scale: Sequence[ArModel]) -> float:
+def residual_norm(blocks: Sequence[ExperimentEquations], theta: Array, scale: Sequence[ArModel]) -> float:
     """Norm of the residuals, each joint in the units of its noise model in ``scale``."""
     keep = [b.keep for b in blocks]
     return float(np.linalg.norm(whitened(residuals(blocks, theta), scale, keep)))
 
 
 def noise_models(
-    blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64], covariance: NDArray[np.float64], max_order: int
+    blocks: Sequence[ExperimentEquations], theta: Array, covariance: Array, max_order: int
 ) -> list[ArModel]:
     """AR model of each joint's noise from the residuals of an estimate (6.21 to 6.25).
 
@@ -215,7 +208,7 @@ def noise_models(
     return [ar.widened(sum(samples)) for ar in ar_models(errors, longest, absorbed=list(lost))]
 
 
-def absorbed_sums(x: NDArray[np.float64], factor: NDArray[np.float64], max_lag: int) -> NDArray[np.float64]:
+def absorbed_sums(x: Array, factor: Array, max_lag: int) -> Array:
     """``sum_t f(t) . f(t - k)`` for lags 0..max_lag of ``f = x factor`` (x: (M, b), factor: (b, b)).
 
     A correction by the share b / M: one stretch of ``SAMPLED`` rows in ``EVERY`` is accurate enough for that.
@@ -228,20 +221,20 @@ def absorbed_sums(x: NDArray[np.float64], factor: NDArray[np.float64], max_lag: 
     found = np.zeros(max_lag + 1)
     for begin in begins:
         found += lagged_sums(x[begin : begin + stretch] @ factor, max_lag, max_lag)
-    scaled: NDArray[np.float64] = found * ((rows - np.arange(max_lag + 1)) / (len(begins) * SAMPLED))
+    scaled: Array = found * ((rows - np.arange(max_lag + 1)) / (len(begins) * SAMPLED))
     return scaled
 
 
-def _square_root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+def _square_root(covariance: Array) -> Array:
     """``F`` with ``F F' = covariance``, also where the covariance is not positive definite by rounding."""
     scale = np.sqrt(np.diag(covariance))
     values, vectors = linalg.eigh(covariance / np.outer(scale, scale))
-    factor: NDArray[np.float64] = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    factor: Array = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     return factor
 
 
 def whitened_residuals(
-    blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64], noise: Sequence[ArModel]
-) -> tuple[tuple[NDArray[np.float64], ...], ...]:
+    blocks: Sequence[ExperimentEquations], theta: Array, noise: Sequence[ArModel]
+) -> tuple[tuple[Array, ...], ...]:
     """Residuals of each joint in standard deviations of its noise model, one array per experiment."""
     return whitened_series(residuals(blocks, theta), noise, [b.keep for b in blocks])

@@ -6,8 +6,8 @@ sliding_window_view 6.5 times. One or two columns take the plain sum: at most th
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import ARITHMETIC, compiled
 
 _ROWS = 8
@@ -20,7 +20,7 @@ _PIECE = 2048
 """Numbers of the plain sum that stay in the cache."""
 
 
-def filter_columns(taps: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+def filter_columns(taps: Array, x: Array) -> Array:
     """``sum_i taps[i] x(t - i)`` of columns (M, b), shape (M - l, b) for l + 1 taps; ValueError if M is too small."""
     span, count = taps.size - 1, x.shape[0] - taps.size + 1
     if count < 1:
@@ -48,7 +48,7 @@ def filter_columns(taps: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray
 
 
 @compiled("f8[::1], f8[:, ::1], f8[:, ::1]", **ARITHMETIC)
-def _add_delayed(taps: NDArray[np.float64], x: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+def _add_delayed(taps: Array, x: Array, out: Array) -> None:
     span, width = taps.size - 1, x.shape[1]
     # The previous sample is the previous row of the array: one long sum per tap.
     late, early = out.ravel(), x.ravel()

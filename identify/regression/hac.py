@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from armident.arrays import Array
 
 
 def newey_west(series: Sequence[Array], lags: int) -> Array:

@@ -4,7 +4,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from armident.arrays import Array
 
 ITERATIONS = 20
 """Most iterations of an iterative estimator."""
@@ -19,15 +20,15 @@ EXACT = 1e-10
 class Iterations(NamedTuple):
     """End of an iteration: last or best theta (b,), convergence, and the rule that ended it, as a sentence."""
 
-    theta: NDArray[np.float64]
+    theta: Array
     done: int
     converged: bool
     reason: str
 
 
 def iterate(
-    step: Callable[[NDArray[np.float64], int], tuple[NDArray[np.float64], float]],
-    start: NDArray[np.float64],
+    step: Callable[[Array, int], tuple[Array, float]],
+    start: Array,
     iterations: int = ITERATIONS,
     tolerance: float = TOLERANCE,
 ) -> Iterations:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from armident.arrays import Array
 from armident.compiled import ARITHMETIC, compiled
 from armident.identify.regression.ar_noise import WHITE, ArModel
 from armident.identify.regression.equations import InstrumentedEquations
@@ -23,8 +24,6 @@ from armident.identify.regression.qr import triangularize, triangularize_parts
 from armident.identify.regression.whitening import nonzero_columns, whitened
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.recursive import recursive_filter
-
-Array = NDArray[np.float64]
 
 SAMPLE = 64
 """Rows per parameter, at least, from which the combinations of the instruments are found."""
@@ -232,10 +231,7 @@ def iv_products(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArModel
 
 
 def _combinations(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArModel]) -> tuple[Array | None, Array]:
-    """``T`` (b, b) that makes columns of ``Z T`` nearly orthonormal, and norms (b,), from every so many rows.
-
-    ``T`` is ``None`` where the columns are far enough from dependent.
-    """
+    """``T`` (b, b) that makes columns of ``Z T`` nearly orthonormal, and norms (b,), from every so many rows."""
     b = blocks[0].z.shape[2]
     total = sum(int(block.keep.sum()) for block in blocks)
     every = max(1, total // (SAMPLE * b))

@@ -6,13 +6,11 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.iv import IvProducts, JointEquations, together
 from armident.identify.regression.whitening import rows_of_joints
-
-Array = NDArray[np.float64]
 
 TIED = 1e4
 """Weight of the difference of two parameters that have one value, over that of the data: a ten-thousandth is left."""

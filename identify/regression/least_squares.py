@@ -5,13 +5,11 @@ from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.regression.qr import triangularize_parts
-
-Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-10
 """Smallest singular value of the column-normalised regressor, relative to the greatest, that counts as excited."""

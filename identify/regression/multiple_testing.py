@@ -1,10 +1,11 @@
 """Corrections for several tests at once."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from armident.arrays import Array
 
 
-def holm(p: NDArray[np.float64]) -> NDArray[np.float64]:
+def holm(p: Array) -> Array:
     """P-values (k,), adjusted by Holm's step-down procedure: reject if at most the level of the whole family.
 
     Source: Holm, A simple sequentially rejective multiple test procedure, Scandinavian Journal of Statistics 6, 1979.

@@ -7,17 +7,15 @@ which CLOE's finite differences amplify to 3e-9 of a parameter: a change needs n
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import ARITHMETIC, compiled
 
 _ROWS = 64
 """Rows eliminated at a time: with a hundred columns they fit the second-level cache."""
 
 
-def triangularize(
-    *blocks: NDArray[np.float64], columns: int, scales: Sequence[NDArray[np.float64]] = ()
-) -> NDArray[np.float64]:
+def triangularize(*blocks: Array, columns: int, scales: Sequence[Array] = ()) -> Array:
     """Reflect ``[A1 A2 ...]`` until its first ``columns`` are upper triangular (Householder); first b rows of ``Q' A``.
 
     ``blocks``: (m, p_i) or (m,), side by side; ``scales``: divisors (p_i,) of their first columns.
@@ -32,9 +30,7 @@ def triangularize(
     return top
 
 
-def triangularize_parts(
-    parts: Iterable[Sequence[NDArray[np.float64]]], columns: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def triangularize_parts(parts: Iterable[Sequence[Array]], columns: int) -> tuple[Array, Array]:
     """`triangularize` of rows that come in parts (equal column counts), of which one is in memory.
 
     Returns factor and projections (b, p), and the norm (p,) of every column, 1 where it is zero.
@@ -51,7 +47,7 @@ def triangularize_parts(
 
 
 @compiled("f8[:, ::1], f8[:, ::1]", "f8[::1, :], f8[:, ::1]", **ARITHMETIC)
-def _reflect(a: NDArray[np.float64], top: NDArray[np.float64]) -> None:
+def _reflect(a: Array, top: Array) -> None:
     """Reduce ``a`` (m, p), which is overwritten, into the triangle kept in ``top`` (b, p)."""
     rows, width = a.shape
     projection = np.empty(width)

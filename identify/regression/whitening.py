@@ -6,10 +6,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import ARITHMETIC, compiled
 from armident.identify.regression.ar_noise import ArModel
-
-Array = NDArray[np.float64]
 
 
 def whitened(

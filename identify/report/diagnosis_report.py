@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.diagnose import DiagnosisResult
 from armident.identify.diagnosis.lack_of_fit import ResidualDependence
@@ -13,8 +14,6 @@ from armident.identify.documents.diagnosis import VERDICTS, DiagnosisDocument, F
 from armident.identify.report.glossary import finding_entries, parameter_meaning
 from armident.identify.report.identification_report import torque_plots
 from armident.identify.report.page import BAND, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
-
-Array = NDArray[np.float64]
 
 LEVELS = {"no_gap": "trustworthy", "explained": "doubtful", "partly_explained": "unusable", "unexplained": "unusable"}
 """Colours of the verdicts, by the levels of an identification."""
@@ -85,10 +84,7 @@ def posterior_probability(finding: Finding) -> str:
 
 
 def closed_gap_share(finding: Finding, document: DiagnosisDocument) -> float | None:
-    """Return the share of the joint's held-out gap above the noise floor that a finding closes; ``None`` without gap.
-
-    The gap after is that without derivative noise where this is smaller.
-    """
+    """Return the share of the joint's held-out gap above the noise floor that a finding closes, if any."""
     after = finding.gap_after
     floor = min(document.noise_floor.by_joint[finding.joint], after)
     gap = finding.gap_before**2 - floor**2
@@ -126,10 +122,7 @@ def _gap_figure(document: DiagnosisDocument) -> str:
 
 
 def _finding_figure(diagnosis: DiagnosisResult, joint: int, lacking: Array | None, own: Array | None) -> str:
-    """Return a figure of the joint's held-out residual without and with a finding, over time and over its variable.
-
-    ``lacking``: torques (M, n) without it, ``None``: the model as configured; ``own``: its torques, ``None``: no term.
-    """
+    """Return a figure of the joint's held-out residual without and with a finding, over time and over its variable."""
     name, unit = diagnosis.robot.joints[joint].name, _unit(diagnosis, joint)
     seen = [d for d in diagnosis.where if d.joint == name]
     without = (diagnosis.before if lacking is None else lacking)[:, joint]
@@ -165,10 +158,7 @@ def telling_stretch(added: Array) -> slice:
 
 
 def followed_variable(diagnosis: DiagnosisResult, joint: int, added: Array) -> tuple[str, str, Array]:
-    """Return the variable that a finding with torque ``added`` (M,) is drawn over: name, unit, values (M,).
-
-    Speed, position or time, the first whose means have the share `FOLLOWS` of its power; otherwise its own torque.
-    """
+    """Return the variable that a finding with torque ``added`` (M,) is drawn over: name, unit, values (M,)."""
     way = "m" if diagnosis.robot.joints[joint].type == "prismatic" else "rad"
     for name, unit, x in (
         ("joint speed", f"{way}/s", diagnosis.qd[:, joint]),

@@ -7,6 +7,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.documents.identification import IdentificationDocument
@@ -14,8 +15,6 @@ from armident.identify.identification.identification_result import Identificatio
 from armident.identify.report.glossary import base_entries
 from armident.identify.report.page import BAND, CONFIGURED, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 from armident.identify.report.plots import Plot, Series, plots_html
-
-Array = NDArray[np.float64]
 
 GOOD_PCT = 5.0
 """Relative standard deviation, percent, up to which a parameter counts as well determined."""

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from armident.arrays import Array
 
 MOST_POINTS = 4000
 """Largest number of points of a plot: two for every pixel of a wide screen."""

@@ -1,15 +1,11 @@
 """HTML report of a prediction: held-out error, measured against predicted torques."""
 
-import numpy as np
-from numpy.typing import NDArray
-
+from armident.arrays import Array
 from armident.identify.documents.prediction import PredictionDocument
 from armident.identify.identification.robot_model import RobotModel
 from armident.identify.report.glossary import base_entries
 from armident.identify.report.identification_report import torque_plots
 from armident.identify.report.page import render
-
-Array = NDArray[np.float64]
 
 
 def prediction_report(

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.identify.effects.terms import arm_model
@@ -17,8 +16,6 @@ from armident.identify.report.glossary import base_entries
 from armident.identify.report.identification_report import FAIR_PCT, GOOD_PCT
 from armident.identify.report.page import MODEL, RESIDUAL, render
 from armident.identify.report.plots import Plot, Series, plots_html
-
-Array = NDArray[np.float64]
 
 MOTION_EVERY, DISTANCE_EVERY = 5, 20
 """Samples of `PERIOD` from one drawn point to the next."""

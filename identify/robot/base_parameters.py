@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from armident.arrays import Array, Ints
 from armident.configs import RobotConfig
-from armident.identify.robot.chain import Chain, Columns, Floats, Ints
+from armident.identify.robot.chain import Chain, Columns
 from armident.identify.robot.kernels import fill_regressor
 from armident.identify.robot.khalil import Form, coefficients_at, khalil_rules, lengths_of, text_of
 
@@ -32,7 +33,7 @@ class BaseParameters:
 
     names: tuple[str, ...]
     independent: Ints
-    regroup: Floats
+    regroup: Array
     formulas: dict[str, str]
     eliminated: tuple[str, ...]
     regrouped: tuple[str, ...]
@@ -108,7 +109,7 @@ def independent_columns(
     names: tuple[str, ...],
     candidates: Ints | None = None,
     seed: int = 0,
-) -> tuple[Ints, Floats]:
+) -> tuple[Ints, Array]:
     """Independent columns of a random regressor, and the dependence of the others on them (A.30 to A.35).
 
     QR decomposition from base to tip, within a link in the order `KEEP_FIRST`, finds the set of tables B.2 and B.3.
@@ -160,7 +161,7 @@ def _preference(robot: RobotConfig, names: tuple[str, ...], candidates: Ints) ->
     return sorted(range(len(candidates)), key=lambda k: (*place.get(names[candidates[k]], last), k))
 
 
-def _mixed(forms: dict[str, Form], row: Floats, candidates: Ints, names: tuple[str, ...]) -> Form:
+def _mixed(forms: dict[str, Form], row: Array, candidates: Ints, names: tuple[str, ...]) -> Form:
     """Sum of the linear forms of the candidates, weighted by ``row``, shape (len(candidates),)."""
     mixed: Form = {}
     for weight, k in zip(row, candidates, strict=True):

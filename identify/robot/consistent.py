@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike
 from scipy import linalg, sparse
 from scipy.special import chdtrc
 
+from armident.arrays import Array, Ints
 from armident.configs import ArmidentError, DataError
 from armident.identify.robot.arm import ArmModel
-from armident.identify.robot.chain import INERTIAL, Floats, Ints
+from armident.identify.robot.chain import INERTIAL
 
 clarabel: Any = untyped_clarabel
 
@@ -64,19 +65,19 @@ class ConsistentParameters:
     """
 
     names: tuple[str, ...]
-    theta: Floats
+    theta: Array
     base_names: tuple[str, ...]
-    theta_base: Floats
+    theta_base: Array
     identifiable: tuple[Identifiability, ...]
     groups: tuple[tuple[str, ...], ...]
-    std: Floats
-    shifts: Floats
+    std: Array
+    shifts: Array
     distance_std: float
     degrees: float
     p_value: float
     compatible: bool
     verdict: str
-    smallest_eigenvalues: Floats
+    smallest_eigenvalues: Array
 
     def document(self) -> dict[str, Any]:
         """Return the result as plain numbers, strings, lists and dictionaries, for a JSON document."""
@@ -105,7 +106,7 @@ class ConsistentParameters:
 
 
 def nearest_consistent(
-    model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike, smallest_link: Floats | None = None
+    model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike, smallest_link: Array | None = None
 ) -> ConsistentParameters:
     """Find the physically consistent parameters nearest to a base estimate (b,) with covariance P.
 
@@ -155,8 +156,8 @@ def nearest_consistent(
 class NearestBase:
     """Base parameters (b,) of the nearest physical arm, their shifts (b,) and Mahalanobis distance, in std."""
 
-    theta: Floats
-    shifts: Floats
+    theta: Array
+    shifts: Array
     distance: float
 
 
@@ -185,7 +186,7 @@ def identifiability(model: ArmModel) -> tuple[Identifiability, ...]:
     return tuple(kinds)
 
 
-def pseudo_inertias(model: ArmModel, theta: ArrayLike) -> Floats:
+def pseudo_inertias(model: ArmModel, theta: ArrayLike) -> Array:
     """Pseudo-inertias (n, 4, 4) of the links: second moments (kg m^2), first moments (kg m) and mass (kg)."""
     xx, xy, xz, yy, yz, zz, mx, my, mz, m = model.values(theta).inertial.T
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
@@ -210,7 +211,7 @@ class _Projection:
     of ``scale`` standard deviations: t values of a thousand beside masses of one are badly conditioned.
     """
 
-    def __init__(self, model: ArmModel, factor: Floats, scale: float, smallest_link: Floats | None = None) -> None:
+    def __init__(self, model: ArmModel, factor: Array, scale: float, smallest_link: Array | None = None) -> None:
         b, p = model.base.regroup.shape
         whitened = linalg.solve_triangular(factor, model.base.regroup, lower=True) / scale
         signed = non_negative(model)
@@ -236,14 +237,14 @@ class _Projection:
         smallest = np.zeros(10) if smallest_link is None else triangle(smallest_link, length)
         self._limits = np.concatenate([np.zeros(b + signed.size), np.tile(-smallest, model.n)])
 
-    def nearest(self, whitened: Floats, price: float = REGULARISATION) -> tuple[Floats, Floats]:
+    def nearest(self, whitened: Array, price: float = REGULARISATION) -> tuple[Array, Array]:
         """Standard parameters and residual (b,) for ``L^-1 theta_base``; ``price``: weight of a kilogram."""
         right = self._limits.copy()
         right[: self._b] = whitened / self._scale
         x = minimise_in_cones(self._quadratic, price * self._weight, self._rows, right, self._cones)
         return x[: self._p], self._scale * x[self._p :]
 
-    def lightest(self, whitened: Floats, nearest: Floats, distance: float) -> Floats:
+    def lightest(self, whitened: Array, nearest: Array, distance: float) -> Array:
         """Find the lightest arm (p,) within `INDIFFERENCE` of the minimum, by increasing the weight of a kilogram."""
         best, price = nearest, REGULARISATION
         while price < 1.0:
@@ -254,7 +255,7 @@ class _Projection:
             best = standard
         return best
 
-    def lost_dimensions(self, whitened: Floats) -> float:
+    def lost_dimensions(self, whitened: Array) -> float:
         """Trace of ``I`` minus the derivative of the projection at ``whitened`` (b,), at least 1."""
         _, here = self.nearest(whitened)
         lost = 0.0
@@ -265,7 +266,7 @@ class _Projection:
         return float(np.clip(lost, 1.0, self._b))
 
 
-def minimise_in_cones(quadratic: Floats, linear: Floats, rows: Floats, right: Floats, cones: Sequence[Any]) -> Floats:
+def minimise_in_cones(quadratic: Array, linear: Array, rows: Array, right: Array, cones: Sequence[Any]) -> Array:
     """Minimise ``x'Qx/2 + c'x`` subject to ``right - rows x`` in the solver's cones, one after the other."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
@@ -278,7 +279,7 @@ def minimise_in_cones(quadratic: Floats, linear: Floats, rows: Floats, right: Fl
     return np.asarray(solution.x, dtype=np.float64)
 
 
-def _whitened(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> tuple[Floats, Floats, Floats, Floats]:
+def _whitened(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array, Array, Array]:
     """Theta and its standard deviations (b,), factor L (b, b) of the covariance, and ``L^-1 theta``."""
     theta, p = np.asarray(theta_base, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
     b = model.base.b
@@ -296,7 +297,7 @@ def _whitened(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> 
     return theta, std, factor, linalg.solve_triangular(factor, theta, lower=True)
 
 
-def _inside(model: ArmModel, theta: Floats, smallest_link: Floats | None = None) -> Floats:
+def _inside(model: ArmModel, theta: Array, smallest_link: Array | None = None) -> Array:
     """Standard parameters (p,) moved into the cones: the solver may violate them by its tolerance."""
     inside = theta.copy()
     signed = non_negative(model)
@@ -310,7 +311,7 @@ def _inside(model: ArmModel, theta: Floats, smallest_link: Floats | None = None)
     return inside
 
 
-def triangles(length: float) -> Floats:
+def triangles(length: float) -> Array:
     """Upper triangles of the pseudo-inertia of each unit inertial parameter, lengths in ``length`` (m): (10, 10).
 
     Column by column with off-diagonals times sqrt(2), an isometry, as of `clarabel.PSDTriangleConeT`.
@@ -327,7 +328,7 @@ def triangles(length: float) -> Floats:
     return out
 
 
-def triangle(matrix: Floats, length: float) -> Floats:
+def triangle(matrix: Array, length: float) -> Array:
     """Upper triangle (10,) of a pseudo-inertia (4, 4), in the units and the order of `triangles`."""
     scale = np.array([1 / length, 1 / length, 1 / length, 1.0])
     scaled = matrix * np.outer(scale, scale)
@@ -340,14 +341,14 @@ def mean_length(model: ArmModel) -> float:
     return float(lengths[lengths > 0].mean()) if lengths.any() else 1.0
 
 
-def _standard_deviations(model: ArmModel, p: Floats, identifiable: Sequence[Identifiability]) -> Floats:
+def _standard_deviations(model: ArmModel, p: Array, identifiable: Sequence[Identifiability]) -> Array:
     """Standard deviations (p,), NaN if not alone: the variance is ``a' P a`` where the unit vector is ``K' a``."""
     combinations = np.linalg.pinv(model.base.regroup)
     std = np.sqrt(np.einsum("ki,ij,kj->k", combinations, p, combinations))
     return np.where(np.array(identifiable) == "alone", std, np.nan)
 
 
-def _verdict(model: ArmModel, distance: float, degrees: float, p_value: float, shifts: Floats) -> str:
+def _verdict(model: ArmModel, distance: float, degrees: float, p_value: float, shifts: Array) -> str:
     if distance <= NOTHING:
         return "the estimate is physically consistent as it is"
     worst = int(np.argmax(np.abs(shifts)))

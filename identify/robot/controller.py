@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from armident.identify.robot.chain import Floats
+from armident.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,10 +18,10 @@ class DiscreteController:
     Later samples use the limited ``nu``. Taps: (n, m), N m/rad or N/m, of outputs without unit; ``saturation``: (n,).
     """
 
-    error_taps: Floats
-    position_taps: Floats
-    output_taps: Floats
-    saturation: Floats
+    error_taps: Array
+    position_taps: Array
+    output_taps: Array
+    saturation: Array
     dt: float
 
     def __post_init__(self) -> None:
@@ -88,7 +88,7 @@ class DiscreteController:
         return cls(taps, empty, empty, _limits(saturation, taps.shape[0]), dt)
 
 
-def _limits(saturation: ArrayLike | None, n: int) -> Floats:
+def _limits(saturation: ArrayLike | None, n: int) -> Array:
     if saturation is None:
         return np.full(n, np.inf)
     return np.broadcast_to(np.asarray(saturation, dtype=np.float64), (n,)).copy()

@@ -6,8 +6,8 @@ Moshier's Cephes library. No branches; errors are a few units in the last place 
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.compiled import inlined
-from armident.identify.robot.chain import Floats
 
 LANES = 4
 """Array lengths are rounded up to a multiple of this number, so that no element needs a scalar loop."""
@@ -26,7 +26,7 @@ def padded(n: int) -> int:
 
 
 @inlined
-def sines_cosines(angle: Floats, sine: Floats, cosine: Floats) -> None:
+def sines_cosines(angle: Array, sine: Array, cosine: Array) -> None:
     """Compute sines and cosines of an array. ``angle``: rad, (m,); ``sine``, ``cosine``: output arrays, (m,) each."""
     for i in range(angle.size):
         x = angle[i]
@@ -55,7 +55,7 @@ def sines_cosines(angle: Floats, sine: Floats, cosine: Floats) -> None:
 
 
 @inlined
-def arctangents(x: Floats, out: Floats, slope: Floats) -> None:
+def arctangents(x: Array, out: Array, slope: Array) -> None:
     """Compute arctangents of an array, rad, and their derivatives ``1 / (1 + x^2)``."""
     for i in range(x.size):
         t = abs(x[i])

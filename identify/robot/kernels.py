@@ -6,8 +6,9 @@ base. Vectors of link j are in frame j, one scalar variable a component. Sizes: 
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.compiled import ARITHMETIC, compiled, inlined
-from armident.identify.robot.chain import Chain, Columns, Floats, Values
+from armident.identify.robot.chain import Chain, Columns, Values
 from armident.identify.robot.elementary import padded, sines_cosines
 
 TWO_OVER_PI = 2.0 / np.pi
@@ -34,7 +35,7 @@ def into_parent(ca: float, sa: float, c: float, s: float, x: float, y: float, z:
 
 
 @inlined
-def turn(n: int, chain: Chain, q: Floats, angle: Floats, sine: Floats, cosine: Floats) -> None:
+def turn(n: int, chain: Chain, q: Array, angle: Array, sine: Array, cosine: Array) -> None:
     """Compute joint angles, rad, sines and cosines of one sample (n,) into arrays of `padded` length."""
     for j in range(n):
         angle[j] = chain.theta[j] + (0.0 if chain.prismatic[j] else q[j])
@@ -43,7 +44,7 @@ def turn(n: int, chain: Chain, q: Floats, angle: Floats, sine: Floats, cosine: F
 
 @compiled("Chain, Columns, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1]", **ARITHMETIC)
 def fill_regressor(
-    chain: Chain, columns: Columns, smoothing: Floats, q: Floats, qd: Floats, qdd: Floats, out: Floats
+    chain: Chain, columns: Columns, smoothing: Array, q: Array, qd: Array, qdd: Array, out: Array
 ) -> None:
     """Compute the regressor of the inverse dynamic model (thesis equation 2.8); column -1: left out.
 
@@ -146,7 +147,7 @@ def fill_regressor(
 
 
 @inlined
-def add_friction(values: Values, smoothing: Floats, qd: Floats, tau: Floats) -> None:
+def add_friction(values: Values, smoothing: Array, qd: Array, tau: Array) -> None:
     """Add friction, offsets and coupled friction of one sample to ``tau`` in place (thesis equations 2.7, B.1)."""
     for j in range(qd.size):
         tau[j] += values.fv[j] * qd[j] + values.off[j]
@@ -164,13 +165,13 @@ def rigid_torque(
     n: int,
     chain: Chain,
     values: Values,
-    q: Floats,
-    qd: Floats,
-    qdd: Floats,
-    sine: Floats,
-    cosine: Floats,
-    work: Floats,
-    tau: Floats,
+    q: Array,
+    qd: Array,
+    qdd: Array,
+    sine: Array,
+    cosine: Array,
+    work: Array,
+    tau: Array,
 ) -> None:
     """Compute the torques of the rigid chain, without friction and rotors, for one sample (A.22 to A.26).
 
@@ -237,9 +238,7 @@ def rigid_torque(
 
 
 @inlined
-def fill_mass_matrix(
-    n: int, chain: Chain, values: Values, q: Floats, sine: Floats, cosine: Floats, mass: Floats
-) -> None:
+def fill_mass_matrix(n: int, chain: Chain, values: Values, q: Array, sine: Array, cosine: Array, mass: Array) -> None:
     """Compute the mass matrix of one posture, with rotors and couplings, by the composite rigid body method."""
     xx = xy = xz = yy = yz = zz = hx = hy = hz = m = 0.0
     for j in range(n - 1, -1, -1):
@@ -315,7 +314,7 @@ def fill_mass_matrix(
 
 @compiled("Chain, Values, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]", **ARITHMETIC)
 def fill_inverse_dynamics(
-    chain: Chain, values: Values, smoothing: Floats, q: Floats, qd: Floats, qdd: Floats, out: Floats
+    chain: Chain, values: Values, smoothing: Array, q: Array, qd: Array, qdd: Array, out: Array
 ) -> None:
     """Compute the joint torques along a motion (N, n), with friction, rotors and couplings."""
     n = chain.d.size
@@ -334,7 +333,7 @@ def fill_inverse_dynamics(
 
 
 @compiled("Chain, Values, f8[:, ::1], f8[:, :, ::1]", **ARITHMETIC)
-def fill_mass_matrices(chain: Chain, values: Values, q: Floats, out: Floats) -> None:
+def fill_mass_matrices(chain: Chain, values: Values, q: Array, out: Array) -> None:
     """Compute the mass matrices (N, n, n) of several postures; see `fill_mass_matrix`."""
     n = chain.d.size
     angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
@@ -344,7 +343,7 @@ def fill_mass_matrices(chain: Chain, values: Values, q: Floats, out: Floats) -> 
 
 
 @inlined
-def cholesky(matrix: Floats, factor: Floats, n: int) -> bool:
+def cholesky(matrix: Array, factor: Array, n: int) -> bool:
     """Factor a symmetric matrix, of which only the lower triangle is read, as ``L D L'``.
 
     ``factor`` (n, n): L below the diagonal, the inverse of D on it, ``D L'`` above. ``False``: not positive definite.
@@ -368,7 +367,7 @@ def cholesky(matrix: Floats, factor: Floats, n: int) -> bool:
 
 
 @inlined
-def solve_factored(factor: Floats, n: int, x: Floats) -> None:
+def solve_factored(factor: Array, n: int, x: Array) -> None:
     """Solve ``L D L' x = b`` in place with the factors of `cholesky`."""
     for i in range(n):
         value = x[i]
@@ -384,7 +383,7 @@ def solve_factored(factor: Floats, n: int, x: Floats) -> None:
 
 @compiled("Chain, Values, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]", **ARITHMETIC)
 def fill_forward_dynamics(
-    chain: Chain, values: Values, smoothing: Floats, q: Floats, qd: Floats, tau: Floats, out: Floats
+    chain: Chain, values: Values, smoothing: Array, q: Array, qd: Array, tau: Array, out: Array
 ) -> int:
     """Compute joint accelerations (2.9); return the first sample whose mass matrix is not positive definite, or -1."""
     n = chain.d.size

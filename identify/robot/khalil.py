@@ -11,8 +11,9 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
-from armident.identify.robot.chain import INERTIAL, Chain, Floats, cos_sin
+from armident.identify.robot.chain import INERTIAL, Chain, cos_sin
 
 Monomial = tuple[tuple[str, int], ...]
 Polynomial = dict[Monomial, float]
@@ -66,7 +67,7 @@ def khalil_rules(robot: RobotConfig, chain: Chain, names: tuple[str, ...]) -> di
     return {name: forms[name] for name in sorted(forms, key=order.__getitem__)}
 
 
-def coefficients_at(form: Form, lengths: Mapping[str, float], names: tuple[str, ...]) -> Floats:
+def coefficients_at(form: Form, lengths: Mapping[str, float], names: tuple[str, ...]) -> Array:
     """Coefficients (p,) of a linear form at given lengths, m, from `lengths_of`."""
     row = np.zeros(len(names))
     for k, name in enumerate(names):
@@ -171,7 +172,7 @@ def _transfer(chain: Chain, j: int) -> dict[str, dict[str, Polynomial]]:
             # Part that does not depend on the joint angle: xx and yy are both yy, half the trace in the plane.
             inertia = np.diag([1.0, 1.0, 0.0])
         first, mass = rotation @ p[6:9], p[9]
-        terms: dict[Monomial, Floats] = {(): _pack(rotation @ inertia @ rotation.T, first, mass)}
+        terms: dict[Monomial, Array] = {(): _pack(rotation @ inertia @ rotation.T, first, mass)}
         for symbol, u in directions.items():
             terms[((symbol, 1),)] = _pack(_shift(u, first), mass * u, 0.0)
             for other, v in directions.items():
@@ -183,17 +184,17 @@ def _transfer(chain: Chain, j: int) -> dict[str, dict[str, Polynomial]]:
     return rows
 
 
-def _shift(u: Floats, v: Floats) -> Floats:
+def _shift(u: Array, v: Array) -> Array:
     """``2 (u.v) I - u v' - v u'``: change of the inertia matrix when a first moment ``v`` is displaced by ``u``."""
-    result: Floats = 2.0 * float(u @ v) * np.eye(3) - np.outer(u, v) - np.outer(v, u)
+    result: Array = 2.0 * float(u @ v) * np.eye(3) - np.outer(u, v) - np.outer(v, u)
     return result
 
 
-def _pack(inertia: Floats, first: Floats, mass: float) -> Floats:
+def _pack(inertia: Array, first: Array, mass: float) -> Array:
     return np.array([*inertia[0], inertia[1, 1], inertia[1, 2], inertia[2, 2], *first, mass])
 
 
-def _axes(chain: Chain) -> tuple[list[Floats], list[Floats]]:
+def _axes(chain: Chain) -> tuple[list[Array], list[Array]]:
     """Unit vectors of the joint axes and a point on each axis, in the base frame at the zero posture."""
     rotation, position = np.eye(3), np.zeros(3)
     axes, origins = [], []
@@ -207,18 +208,18 @@ def _axes(chain: Chain) -> tuple[list[Floats], list[Floats]]:
     return axes, origins
 
 
-def _in_link_frame(chain: Chain, j: int, direction: Floats, axes: list[Floats]) -> Floats:
+def _in_link_frame(chain: Chain, j: int, direction: Array, axes: list[Array]) -> Array:
     """Transform a direction (3,) from the base frame to the frame of link j+1, at the zero posture."""
     rotation = np.eye(3)
     for k in range(j + 1):
         ca, sa = chain.cos_alpha[k], chain.sin_alpha[k]
         c, s = np.cos(chain.theta[k]), np.sin(chain.theta[k])
         rotation = rotation @ np.array([[c, -s, 0.0], [s * ca, c * ca, -sa], [s * sa, c * sa, ca]])
-    result: Floats = rotation.T @ direction
+    result: Array = rotation.T @ direction
     return result
 
 
-def _direction_unseen(forms: dict[str, Form], own: Mapping[str, str], axis: Floats) -> None:
+def _direction_unseen(forms: dict[str, Form], own: Mapping[str, str], axis: Array) -> None:
     """Regroup the first moment along the only axis of rotation, which has no effect on the torques (rule 4)."""
     x, y, z = (float(v) for v in axis)
     if abs(z) > PARALLEL:
@@ -235,13 +236,13 @@ def _direction_unseen(forms: dict[str, Form], own: Mapping[str, str], axis: Floa
             _add(forms[own[kind]], gone, {(): factor})
 
 
-def _alone_along_axis(prismatic: list[bool], axes: list[Floats], j: int) -> bool:
+def _alone_along_axis(prismatic: list[bool], axes: list[Array], j: int) -> bool:
     """Return True if no joint before joint j moves its link along the axis of joint j."""
     return all(_orthogonal(axes[i], axes[j]) if prismatic[i] else _parallel(axes[i], axes[j]) for i in range(j))
 
 
 def _rotor_into_mass(
-    forms: dict[str, Form], robot: RobotConfig, chain: Chain, j: int, axis: Floats, rows: Mapping[str, Polynomial]
+    forms: dict[str, Form], robot: RobotConfig, chain: Chain, j: int, axis: Array, rows: Mapping[str, Polynomial]
 ) -> None:
     """Regroup the rotor inertia ``ia`` of a prismatic joint with the mass that it moves (rule 7)."""
     gone = forms.pop(f"ia{j + 1}")
@@ -257,16 +258,16 @@ def _rotor_into_mass(
             _add(target, gone, kept)
 
 
-def _still_axis(chain: Chain, axes: list[Floats], origins: list[Floats], r1: int, j: int) -> bool:
+def _still_axis(chain: Chain, axes: list[Array], origins: list[Array], r1: int, j: int) -> bool:
     """Return True if joint j rotates about the axis of joint ``r1``, parallel to gravity and to all earlier axes."""
     along = _parallel(axes[j], axes[r1]) and np.linalg.norm(np.cross(origins[j] - origins[r1], axes[r1])) < PARALLEL
     up = np.linalg.norm(np.cross(chain.gravity, axes[r1])) < PARALLEL
     return bool(along and up and all(_parallel(axes[i], axes[r1]) for i in range(j)))
 
 
-def _parallel(a: Floats, b: Floats) -> bool:
+def _parallel(a: Array, b: Array) -> bool:
     return bool(np.linalg.norm(np.cross(a, b)) < PARALLEL)
 
 
-def _orthogonal(a: Floats, b: Floats) -> bool:
+def _orthogonal(a: Array, b: Array) -> bool:
     return bool(abs(a @ b) < PARALLEL)

@@ -6,9 +6,10 @@ import clarabel as untyped_clarabel
 import numpy as np
 from scipy import linalg
 
+from armident.arrays import Array
 from armident.configs import ArmidentError
 from armident.identify.robot.arm import ArmModel
-from armident.identify.robot.chain import INERTIAL, Floats
+from armident.identify.robot.chain import INERTIAL
 from armident.identify.robot.consistent import (
     mean_length,
     minimise_in_cones,
@@ -27,7 +28,7 @@ INSIDE = -1e-12
 """Smallest eigenvalue of a pseudo-inertia (kg and kg m^2), and smallest coefficient, that rounding may leave."""
 
 
-def nearest_to_known(model: ArmModel, theta: Floats, known: Floats, smallest_link: Floats) -> Floats:
+def nearest_to_known(model: ArmModel, theta: Array, known: Array, smallest_link: Array) -> Array:
     """Return the consistent standard parameters nearest to known ones (p,), with the same base parameters.
 
     Distances in kg: first moments over the arm's mean length, moments of inertia over its square; only links count.

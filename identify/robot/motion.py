@@ -6,14 +6,13 @@ from itertools import count, islice
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import ARITHMETIC, compiled
 
 if TYPE_CHECKING:
     from armident.identify.robot.arm import ArmModel
 
-Array = NDArray[np.float64]
 
 STEP = 1e-6
 """Step of the forward differences, rad and rad/s or m and m/s: rounding errors are 2e-10 of a torque, and those of
@@ -254,10 +253,7 @@ class Motion:
         return self._slopes[key]
 
     def _smooth(self, links: bool) -> tuple[Array, Array]:
-        """Predicted torques (N, n), and derivatives (n, N, n) by the accelerations of the joints on the first axis.
-
-        The sign of the friction is always smoothed: a jump has no derivative.
-        """
+        """Predicted torques (N, n), and derivatives (n, N, n) by the accelerations of the joints on the first axis."""
         if links not in self._still:
             theta = self.links if links else self._theta
             masses = self.model.mass_matrix(theta, self.q)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from armident.arrays import Array
 from armident.identify.robot.arm import ArmModel
-from armident.identify.robot.chain import Floats
 
 SMALLEST_EIGENVALUE = 1e-6
 """Ratio of smallest to largest eigenvalue above which a mass matrix counts as positive definite: physical arms have
@@ -20,7 +20,7 @@ MOST_HALVINGS = 30
 class Damped:
     """Physical iterate, applied fraction of its step (0 to 1), and the corrected defects; empty if there were none."""
 
-    theta: Floats
+    theta: Array
     step: float
     reason: str
 
@@ -54,7 +54,7 @@ def damp_to_physical(model: ArmModel, theta: ArrayLike, theta_previous: ArrayLik
     return Damped(candidate, step, "; ".join(reasons))
 
 
-def _names(model: ArmModel, theta: Floats) -> tuple[str, ...]:
+def _names(model: ArmModel, theta: Array) -> tuple[str, ...]:
     return model.names if theta.size == len(model.names) else model.base.names
 
 
@@ -63,7 +63,7 @@ def _friction(names: tuple[str, ...], terms: int) -> list[int]:
     return [k for k, name in enumerate(names[: len(names) - terms]) if name.startswith(("fv", "fc"))]
 
 
-def _mass_failures(model: ArmModel, theta: Floats, postures: Floats) -> tuple[int, float]:
+def _mass_failures(model: ArmModel, theta: Array, postures: Array) -> tuple[int, float]:
     """Number of postures without positive definite mass matrix, and the smallest eigenvalue of all postures."""
     eigenvalues = np.linalg.eigvalsh(model.mass_matrix(theta, postures))
     bad = eigenvalues[:, 0] <= SMALLEST_EIGENVALUE * np.abs(eigenvalues).max(axis=1)

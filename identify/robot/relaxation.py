@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from armident.arrays import Array
 from armident.identify.robot.arm import ArmModel
-from armident.identify.robot.chain import Floats
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation, simulate
 from armident.identify.signals.bandpass import butterworth
@@ -82,26 +82,26 @@ def simulate_with_terms(
     pushed = np.zeros_like(reference) if disturbance is None else np.asarray(disturbance, dtype=np.float64)
     # One instant of ``step``: the torque is needed in its band only.
     step = max(1, int(1.0 / (dt * RATE * band_hz)))
-    load: Floats = np.zeros_like(reference[::step])
-    inertia: Floats = np.zeros(model.n)
-    best: tuple[float, Simulation, Floats] | None = None
+    load: Array = np.zeros_like(reference[::step])
+    inertia: Array = np.zeros(model.n)
+    best: tuple[float, Simulation, Array] | None = None
     past = _Past()
 
-    def torque_at(run: Simulation | Derivatives) -> Floats:
+    def torque_at(run: Simulation | Derivatives) -> Array:
         q, qd, qdd = (np.ascontiguousarray(x[::step]) for x in (run.q, run.qd, run.qdd))
         return known.term_torque(known.motion(q, qd, qdd, step * dt, start), values)
 
-    def answer_of(torque: Floats, run: Simulation | Derivatives) -> Floats:
+    def answer_of(torque: Array, run: Simulation | Derivatives) -> Array:
         # The load is held during each period: take the torque in its middle.
         rest = torque - run.qdd[::step] * inertia
         rest[:-1] += 0.5 / step * (rest[1:] - rest[:-1])
         return _slow(rest, step * dt, band_hz)
 
-    def felt(torque: Floats, run: Simulation | Derivatives) -> Floats:
+    def felt(torque: Array, run: Simulation | Derivatives) -> Array:
         slow = (_slow(x, step * dt, band_hz) for x in (torque, run.qdd[::step]))
         return _inertia(model, theta, run.q, *slow)
 
-    def at_samples(load: Floats) -> Floats:
+    def at_samples(load: Array) -> Array:
         at, known_at = np.arange(reference.shape[0]), step * np.arange(load.shape[0])
         return np.stack([np.interp(at, known_at, own) for own in load.T], axis=1)
 
@@ -147,12 +147,12 @@ def simulate_with_terms(
     return best[1]
 
 
-def _slow(values: Floats, dt: float, band_hz: float) -> Floats:
+def _slow(values: Array, dt: float, band_hz: float) -> Array:
     """Low-pass ``values`` (N, n) at ``band_hz``; unchanged if it is not below 0.45 of the sampling rate."""
     return butterworth(values, dt, band_hz) if band_hz < 0.45 / dt else values
 
 
-def _inertia(model: ArmModel, theta: Floats, q: Floats, torque: Floats, qdd: Floats) -> Floats:
+def _inertia(model: ArmModel, theta: Array, q: Array, torque: Array, qdd: Array) -> Array:
     """Inertia (n,) of each joint that fits the torque (N, n) of the terms, zero where it is small; kg m^2 or kg."""
     found = np.sum(torque * qdd, axis=0) / np.maximum(np.sum(qdd * qdd, axis=0), 1e-300)
     postures = q[:: max(1, q.shape[0] // INERTIA_POSTURES)]
@@ -165,10 +165,10 @@ class _Past:
     """Loads of the last simulations and their differences from the torque of the terms, for Anderson mixing."""
 
     def __init__(self) -> None:
-        self._loads: deque[Floats] = deque(maxlen=MEMORY)
-        self._missing: deque[Floats] = deque(maxlen=MEMORY)
+        self._loads: deque[Array] = deque(maxlen=MEMORY)
+        self._missing: deque[Array] = deque(maxlen=MEMORY)
 
-    def next(self, load: Floats, missing: Floats) -> Floats:
+    def next(self, load: Array, missing: Array) -> Array:
         """Return the next load (N, n): of least difference in a linear model, plus `STEP` times that difference."""
         self._loads.append(load)
         self._missing.append(missing)
@@ -179,5 +179,5 @@ class _Past:
             for x in (self._loads, self._missing)
         )
         weights = np.linalg.lstsq(answers, missing.ravel(), rcond=1e-10)[0]
-        guess: Floats = load + STEP * missing - ((loads + STEP * answers) @ weights).reshape(load.shape)
+        guess: Array = load + STEP * missing - ((loads + STEP * answers) @ weights).reshape(load.shape)
         return guess

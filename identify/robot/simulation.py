@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from armident.arrays import Array, Ints
 from armident.compiled import ARITHMETIC, compiled, inlined
 from armident.identify.robot.arm import ArmModel
-from armident.identify.robot.chain import Chain, Floats, Ints, Values
+from armident.identify.robot.chain import Chain, Values
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.elementary import arctangents, padded
 from armident.identify.robot.kernels import TWO_OVER_PI, cholesky, fill_mass_matrix, rigid_torque, solve_factored, turn
@@ -58,10 +59,10 @@ class Simulation:
     ``diverged_at``: state not finite, velocity above its limit or mass matrix not positive definite; ``None``: never.
     """
 
-    q: Floats
-    qd: Floats
-    qdd: Floats
-    tau: Floats
+    q: Array
+    qd: Array
+    qdd: Array
+    tau: Array
     diverged_at: int | None
 
 
@@ -143,13 +144,13 @@ def friction(
     n: int,
     pairs: int,
     values: Values,
-    v: Floats,
-    x: Floats,
-    bend: Floats,
-    steep: Floats,
-    force: Floats,
-    slope: Floats,
-    pair_slope: Floats,
+    v: Array,
+    x: Array,
+    bend: Array,
+    steep: Array,
+    force: Array,
+    slope: Array,
+    pair_slope: Array,
 ) -> None:
     """Compute friction torques and their derivatives with respect to velocity (thesis equations 2.7, B.1).
 
@@ -179,7 +180,7 @@ def friction(
 
 
 @inlined
-def divisions(n: int, pairs: int, values: Values, v: Floats, a: Floats, dt: float) -> int:
+def divisions(n: int, pairs: int, values: Values, v: Array, a: Array, dt: float) -> int:
     """Number of integration steps in one sample: more while a joint with Coulomb friction passes standstill."""
     most = 1
     for j in range(n):
@@ -197,7 +198,7 @@ def divisions(n: int, pairs: int, values: Values, v: Floats, a: Floats, dt: floa
 
 @inlined
 def stiffen(
-    n: int, pairs: int, mass: Floats, step: float, coupled: Ints, slope: Floats, pair_slope: Floats, stiff: Floats
+    n: int, pairs: int, mass: Array, step: float, coupled: Ints, slope: Array, pair_slope: Array, stiff: Array
 ) -> None:
     """Lower triangle of the matrix of the implicit stages, ``mass + GAMMA step F`` with the friction derivative F."""
     for i in range(n):
@@ -213,21 +214,21 @@ def stiffen(
 def run(
     chain: Chain,
     values: Values,
-    transmission: Floats,
-    inverse_transmission: Floats,
-    error_taps: Floats,
-    position_taps: Floats,
-    output_taps: Floats,
-    saturation: Floats,
+    transmission: Array,
+    inverse_transmission: Array,
+    error_taps: Array,
+    position_taps: Array,
+    output_taps: Array,
+    saturation: Array,
     memory: int,
-    reference: Floats,
-    disturbance: Floats,
+    reference: Array,
+    disturbance: Array,
     dt: float,
-    max_velocity: Floats,
-    q: Floats,
-    qd: Floats,
-    qdd: Floats,
-    tau: Floats,
+    max_velocity: Array,
+    q: Array,
+    qd: Array,
+    qdd: Array,
+    tau: Array,
     joints: Sized,
     couplings: Sized,
 ) -> int:

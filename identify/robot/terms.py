@@ -2,9 +2,7 @@
 
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from armident.arrays import Array
 from armident.identify.robot.motion import Motion
 
 
@@ -20,7 +18,7 @@ class ModelTerm(Protocol):
         """Units of the linear parameters as text, (k,)."""
 
     @property
-    def values(self) -> NDArray[np.float64]:
+    def values(self) -> Array:
         """Values of the linear parameters in the configuration, (k,), each in its unit."""
 
     @property
@@ -31,8 +29,8 @@ class ModelTerm(Protocol):
     def scales_torque(self) -> bool:
         """True if the term is a fraction of the torque that the model predicts."""
 
-    def columns(self, motion: Motion) -> NDArray[np.float64]:
+    def columns(self, motion: Motion) -> Array:
         """Return the torques (N m or N) of all n joints per unit of each linear parameter, (N, n, k)."""
 
-    def add_torque(self, motion: Motion, values: NDArray[np.float64], torque: NDArray[np.float64]) -> None:
+    def add_torque(self, motion: Motion, values: Array, torque: Array) -> None:
         """Add the torque of the term, with its linear parameters (k,), to that of all joints (N, n) in place."""

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
+from armident.arrays import Array
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, regressors
 from armident.identify.setup.limited_least_squares import every_column
 
-Array = NDArray[np.float64]
 OrderCriterion = Callable[[Array], float]
 
 
@@ -44,10 +44,7 @@ def by_rows(bench: Bench, h: Hypothesis) -> Hypothesis:
 
 
 def by_friction(bench: Bench, h: Hypothesis) -> Array:
-    """Return the signed permutation (n, n) from recorded torques to the recorded positions that they belong to.
-
-    Dry friction changes only the torque of its own joint where that joint turns round. Needs no model of the arm.
-    """
+    """Return the signed permutation (n, n) from recorded torques to the recorded positions that they belong to."""
     n = bench.n
     rows = bench.rows(np.eye(n))
     dry, slow = rows.friction[:, :, 0], rows.qd

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.effects.wiring import PositionOffset
@@ -25,8 +26,6 @@ from armident.identify.setup.torque_shift import common_shift, long_torque_shift
 from armident.identify.setup.weight import weight_findings
 from armident.identify.setup.zero_offset import zero_offset
 from armident.identify.signals.experiments import Experiment, check_one_rate
-
-Array = NDArray[np.float64]
 
 LONGEST_SHIFT_S = 0.05
 """Longest common shift of the torques that references are asked for, s: filters of drives are faster."""
@@ -54,10 +53,7 @@ TRIED = {
 
 
 def check_setup(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
-    """Compare the set-up as configured with its possible mistakes, each with everything refitted.
-
-    Recordings: SI, joint side, one rate. Mistakes that ``effects`` of the configuration correct are corrected first.
-    """
+    """Compare the set-up as configured with its possible mistakes, each with everything refitted."""
     _validate(experiments, robot)
     # The matrices are small: threads delay each other.
     with threadpool_limits(1):
@@ -153,10 +149,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
 
 
 def _whole(experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]) -> list[int]:
-    """Return the numbers of the experiments that move all joints that move in any; all if there are none.
-
-    A joint at rest says nothing of its order, scale or clock, and its friction would pass for a mistake of them.
-    """
+    """Return the numbers of the experiments that move all joints that move in any; all if there are none."""
     whole = [k for k, e in enumerate(experiments) if signals.moving_joints([e], robot)[moving].all()]
     return whole or list(range(len(experiments)))
 
@@ -192,10 +185,7 @@ def _unless_zero_explains(search: Search, best: Step) -> Step:
 
 
 def _stretch(bench: Bench, best: Step) -> tuple[Step, ChangedStretch | None]:
-    """Return the set-up, and the stretch of time in which the arm is another one.
-
-    A change in time competes with the corrections: they go where it explains the torques as well without them.
-    """
+    """Return the set-up, and the stretch of time in which the arm is another one."""
     found = stretch(bench, best.h)
     if best.mistakes and best.h.clock == 1.0:
         configured = Step(as_configured(bench.robot))
@@ -221,10 +211,7 @@ def _searched(
 
 
 def _with_exact_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> Step:
-    """Replace a common shift that the search has found, if it can be estimated to a factor of 2.
-
-    Prediction gives too short a shift where the closed loop follows disturbances, and where a joint stops suddenly.
-    """
+    """Replace a common shift that the search has found, if it can be estimated to a factor of 2."""
     common = float(np.median(best.h.shift[bench.moving]))
     found = long_torque_shift(experiments, bench, best.h, common, abs(common))
     if found is None or found.std > abs(found.samples) / 2.0:
@@ -233,10 +220,7 @@ def _with_exact_shift(experiments: Sequence[Experiment], bench: Bench, best: Ste
 
 
 def _with_instrumented_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> Step:
-    """Add a common shift that the recorded references show and the search has not found, if two joints confirm it.
-
-    Disturbances in the closed loop may hide it from prediction, not from the instruments.
-    """
+    """Add a common shift that the recorded references show and the search has not found, if two joints confirm it."""
     found = long_torque_shift(experiments, bench, best.h, 0.0, LONGEST_SHIFT_S)
     if found is None or not found.confirmed:
         return best

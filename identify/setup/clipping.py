@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from armident.arrays import Array
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, equations, fit_rows
-
-Array = NDArray[np.float64]
 
 NEAR = 0.94
 """Torque over its largest value from which on a row may be clipped: noise and filters blur the level."""
@@ -74,10 +73,7 @@ class Clip:
 
 
 def clipped_torques(bench: Bench, h: Hypothesis) -> list[Clip]:
-    """Return the torques whose largest values lie where the model, fitted to the other rows, needs clearly more.
-
-    Dry friction is also nearly constant over long times, but there the model needs no more than recorded.
-    """
+    """Return the torques whose largest values lie where the model, fitted to the other rows, needs clearly more."""
     x, y, physical = equations(bench.everywhere, h)
     found = []
     for k in np.flatnonzero(bench.moving):

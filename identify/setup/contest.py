@@ -4,17 +4,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from armident.arrays import Array
 from armident.identify.setup.fit import Hypothesis, fit, joint_errors
 from armident.identify.setup.moves import signs_of
 from armident.identify.setup.plausible import log_plausibility
 from armident.identify.setup.prior import WIRING, Mistake, cost
 from armident.identify.setup.result import WIRED
 from armident.identify.setup.search import Search, Step, angle_between, independent_rows
-
-Array = NDArray[np.float64]
 
 EQUAL = float(np.log(10.0))
 """Nats below the best set-up down to which another one explains the recordings equally well."""
@@ -173,10 +171,7 @@ def _other_signs(search: Search, found: Step) -> Iterator[Step]:
 
 
 def same_correction(kind: str, joints: Sequence[int], a: Hypothesis, b: Hypothesis, *, each_own: bool = False) -> bool:
-    """True if two hypotheses contain the same correction of a kind at some joints.
-
-    ``each_own``: of torques only the proportions between the joints count.
-    """
+    """True if two hypotheses contain the same correction of a kind at some joints."""
     if kind.startswith("gravity"):
         if not (a.gravity.any() and b.gravity.any()):
             return not a.gravity.any() and not b.gravity.any()

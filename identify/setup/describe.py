@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect
 from armident.identify.setup.bench import Bench
@@ -18,8 +19,6 @@ from armident.identify.setup.prior import WIRING, Mistake
 from armident.identify.setup.result import SetupFinding
 from armident.identify.setup.scales import LEAST_TORQUE
 from armident.identify.setup.search import EACH_OWN, RANKED_ROWS, Step
-
-Array = NDArray[np.float64]
 
 SCALES = ("position_unit", "torque_unit", "side", "gear_ratio", "torque_scale", "torque_scales", "position_scale")
 """Families that scale signals."""
@@ -118,10 +117,7 @@ def _groups(step: Step) -> Iterator[tuple[int, int]]:
 
 
 def _of_a_drive(step: Step, k: int, bench: Bench) -> bool:
-    """True for torque constants that differ moderately: effects of the drives (`drive_gain_error`).
-
-    Of a unit of every drive, those count that the motion determines.
-    """
+    """True for torque constants that differ moderately: effects of the drives (`drive_gain_error`)."""
     logs = np.log(np.abs(np.diag(step.mistakes[k].torque)))
     if step.families[k] == "torque_scale":
         return bool(np.all(np.abs(logs) < np.log(LEAST_TORQUE)))

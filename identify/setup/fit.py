@@ -5,11 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.limited_least_squares import FLOOR, PASSES, Normal, Solution, every_column
 from armident.identify.setup.torque_equations import PARTS
-
-Array = NDArray[np.float64]
 
 CONVERGED = 6
 """The same where the slope of the fit is used, which assumes that they have converged."""

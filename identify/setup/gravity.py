@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
+from armident.arrays import Array
 from armident.identify.setup.fit import Hypothesis, Misfit
 
-Array = NDArray[np.float64]
 Criterion = Callable[[Hypothesis], float]
 SlopedCriterion = Callable[[Hypothesis], Misfit]
 
@@ -40,10 +40,7 @@ SHIFTS_S = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
 
 
 def best_direction(h: Hypothesis, criterion: SlopedCriterion) -> Hypothesis:
-    """Return the hypothesis with the best direction of gravity, of the same magnitude.
-
-    Opposite directions fit equally where first moments change sign, too: the one nearest to the configured one wins.
-    """
+    """Return the hypothesis with the best direction of gravity, of the same magnitude."""
     size = float(np.linalg.norm(h.gravity)) or STANDARD
     tried = sorted(DIRECTIONS, key=lambda d: criterion(replace(h, gravity=size * d)).value)
     starts = [*tried[:STARTS], *([h.gravity / size] if h.gravity.any() else [])]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.setup.calibration import CORRECTED, NAMED, probability
 from armident.identify.setup.contest import LEAST_ERROR, Contest, words_of
@@ -13,8 +14,6 @@ from armident.identify.setup.describe import Described, corrected_robot, describ
 from armident.identify.setup.plausible import LEAST_ODDS
 from armident.identify.setup.result import WIRED, SetupFinding
 from armident.identify.setup.search import LEAST_DROP, NOT_UNDERSTOOD, STRUCTURED, Search, Step
-
-Array = NDArray[np.float64]
 
 NEXT_STEP = (
     "move one joint at a time, and compare direction, angle and torque of each with the arm; check the order of the "

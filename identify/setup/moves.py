@@ -5,13 +5,11 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.effects.wiring import raw_scales
 from armident.identify.setup.fit import Hypothesis
-
-Array = NDArray[np.float64]
 
 DEGREES = np.pi / 180.0
 THOUSANDTH = 1e-3
@@ -59,10 +57,7 @@ def signs_of(robot: RobotConfig, joints: Sequence[int], where: str = "") -> Iter
 
 
 def set_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
-    """The same mistake of sign, unit or side at every set of two and more joints.
-
-    Joints are coupled: one of such mistakes, corrected alone, may improve nothing.
-    """
+    """The same mistake of sign, unit or side at every set of two and more joints."""
     for size in range(2, len(joints) + 1):
         for chosen in combinations(joints, size):
             yield from signs_of(robot, chosen)

@@ -5,10 +5,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis
-
-Array = NDArray[np.float64]
 
 POSITION_MOST = 1.2
 """Largest position over the limit that is plausible: limits of a configuration are often rounded."""
@@ -70,10 +69,7 @@ def log_plausibility(bench: Bench, h: Hypothesis) -> float:
 
 
 def worst_change(bench: Bench, old: Hypothesis, new: Hypothesis) -> float:
-    """Smallest change over the moving joints of the log plausibility of their own signals; negative if one gets worse.
-
-    A wrong unit of one joint hardly changes the mean over all joints.
-    """
+    """Smallest change over the moving joints of the log plausibility of their own signals."""
 
     def each(h: Hypothesis) -> Array:
         logs, usable = _logs(bench, h)

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.setup.fit import Hypothesis
-
-Array = NDArray[np.float64]
 
 MISTAKE = math.log(100.0)
 """Cost of each mistake, nats: one set-up of a hundred has a mistake of a given kind."""
@@ -69,10 +68,7 @@ def composed(start: Hypothesis, mistakes: Iterable[Mistake]) -> Hypothesis:
 
 
 def cost(mistakes: Iterable[Mistake], n: int) -> float:
-    """Negative logarithm of the prior of a hypothesis, nats.
-
-    Permutations and signs are judged by their product: two ways to the same wiring cost the same.
-    """
+    """Negative logarithm of the prior of a hypothesis, nats."""
     total, position, torque = 0.0, np.eye(n), np.eye(n)
     for m in mistakes:
         if m.family in WIRING and not m.raw:

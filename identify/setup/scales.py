@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.setup.fit import Hypothesis, Misfit
 from armident.identify.setup.moves import Move, scaled
 
-Array = NDArray[np.float64]
 Criterion = Callable[[Hypothesis], float]
 SlopedCriterion = Callable[[Hypothesis, NDArray[np.bool_]], Misfit]
 

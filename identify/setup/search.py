@@ -8,14 +8,13 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.setup import assignment, gravity, moves, scales
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, fit, fit_shares, held_out, joint_errors, misfit
 from armident.identify.setup.limited_least_squares import FLOOR
 from armident.identify.setup.plausible import LEAST_ODDS, equal_shares, log_plausibility, plausible_factor, worst_change
 from armident.identify.setup.prior import Mistake, between, composed, cost, wiring_cost
-
-Array = NDArray[np.float64]
 
 MOST_MISTAKES = 6
 """Largest number of mistakes that are corrected one after the other."""
@@ -143,10 +142,6 @@ class Search:
         """Few instants, with which all single mistakes are ranked first."""
         return self.bench.coarse(FEW_ROWS)
 
-    def few_rank(self, h: Hypothesis) -> float:
-        """Criterion of the ranking with few instants."""
-        return _rank(self.few, h)
-
     def run(self, start: Hypothesis) -> Step:
         """Return the corrected set-up. ``start``: the set-up as configured."""
         first = replace(Step(start), rank=self.rank(start))
@@ -228,10 +223,7 @@ class Search:
         return best
 
     def _material(self, old: Hypothesis, new: Hypothesis, least: float) -> bool:
-        """True if a correction makes no joint implausible, and more joints improve by a factor than get worse.
-
-        With and without the free terms: helping these alone only fits an effect that the model lacks.
-        """
+        """True if a correction makes no joint implausible, and more joints improve by a factor than get worse."""
         if worst_change(self.bench, old, new) < -LEAST_ODDS:
             return False
         return all(self._improved(old, new, free=free) >= np.log(least) for free in (True, False))
@@ -312,7 +304,7 @@ class Search:
                 move
                 for j in joints
                 if len(joints) > 1
-                for move in scales.scale_moves(robot, j, h, self.few_rank, self.rank)
+                for move in scales.scale_moves(robot, j, h, partial(_rank, self.few), self.rank)
             ),
         )
         for move in singles:
@@ -416,10 +408,7 @@ def angle_between(a: Array, b: Array) -> float:
 
 
 def independent_rows(residual: Array) -> Array:
-    """Number (n,) of independent rows with the serial correlation of residuals (M, n), at least 4.
-
-    ``M (1 - r) / (1 + r)`` for the correlation r of neighbouring rows (Bartlett 1946).
-    """
+    """Number (n,), at least 4, of independent rows of serially correlated residuals (M, n) (Bartlett 1946)."""
     power = np.maximum((residual**2).sum(axis=0), 1e-300)
     r = np.clip((residual[1:] * residual[:-1]).sum(axis=0) / power, 0.0, 0.99)
     rows: Array = np.maximum(residual.shape[0] * (1 - r) / (1 + r), 4.0)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.daq.recording.faults.jumps import JumpCriteria, jumps
 from armident.daq.recording.faults.updates import held, resolution
@@ -12,8 +13,6 @@ from armident.identify.setup.plausible import NO_LIMIT
 from armident.identify.setup.result import SetupFinding
 from armident.identify.signals.bandwidth import velocity_spectra
 from armident.identify.signals.experiments import Experiment
-
-Array = NDArray[np.float64]
 
 STILL_SHARE = 1e-3
 """Share of its position range below which a joint counts as not moving."""
@@ -101,10 +100,7 @@ def small_torque_findings(experiments: Sequence[Experiment], robot: RobotConfig)
 def absolute_findings(
     experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]
 ) -> list[SetupFinding]:
-    """Return a finding if the torques of all moving joints are never negative: their sign is lost, or coded otherwise.
-
-    Gravity may keep one joint above zero, but not all of an arm.
-    """
+    """Return a finding if the torques of all moving joints are never negative: their sign is lost."""
     lowest = np.min([e.tau.min(axis=0) for e in experiments], axis=0)[moving]
     highest = np.max([e.tau.max(axis=0) for e in experiments], axis=0)[moving]
     reached = np.any(lowest <= REACHES_ZERO * highest) and np.all(highest > 0.0)

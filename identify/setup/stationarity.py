@@ -10,12 +10,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array, Mask
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, equations
 from armident.identify.setup.result import SetupFinding, Span
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 BLOCKS = 30
 """Blocks of time between which a stretch begins and ends; its ends are then found to a row."""

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.robot.arm import ArmModel
 from armident.identify.setup.limited_least_squares import Normal, normal_equations
 
-Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 
 SLOW = 0.02

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.regression.ar_noise import ArModel, fit_ar
 from armident.identify.setup.bench import Bench, make_bench
@@ -18,7 +18,6 @@ from armident.identify.setup.fit import Hypothesis
 from armident.identify.setup.result import CONVENTIONS, TorqueShift
 from armident.identify.signals.experiments import Experiment
 
-Array = NDArray[np.float64]
 Motion = tuple[Array, Array, Array]
 
 SHIFT_RATE = 20.0
@@ -75,10 +74,7 @@ class _Columns:
 def long_torque_shift(
     experiments: Sequence[Experiment], bench: Bench, h: Hypothesis, first_s: float, reach_s: float
 ) -> TorqueShift | None:
-    """Estimate a common shift of many samples; ``None`` where none is determined within ``reach_s`` of ``first_s``.
-
-    The estimate is linear: it is repeated with torques moved by the last value until that changes no more.
-    """
+    """Estimate a common shift of many samples; ``None`` where none is determined within ``reach_s`` of ``first_s``."""
     first, reach = first_s / bench.period, reach_s / bench.period
     shift = first
     for _ in range(ROUNDS):
@@ -99,10 +95,7 @@ def long_torque_shift(
 
 
 def common_shift(experiments: Sequence[Experiment], bench: Bench, h: Hypothesis) -> TorqueShift:
-    """Estimate the common shift of the torques, up to `RANGE` samples, and that of every joint.
-
-    Raises DataError or numpy.linalg.LinAlgError if the motion determines no shift.
-    """
+    """Estimate the common shift of the torques, up to `RANGE` samples, and that of every joint."""
     return _common(_estimated(experiments, bench, h, 0.0), RANGE)
 
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Fit, Hypothesis, fit, regressors
@@ -13,8 +14,6 @@ from armident.identify.setup.plausible import LEAST_ODDS
 from armident.identify.setup.prior import MISTAKE
 from armident.identify.setup.result import SetupFinding
 from armident.identify.setup.search import independent_rows
-
-Array = NDArray[np.float64]
 
 LIGHTEST = 1.4
 """First moment of the stretched arm about its shoulder over the cube of its reach, kg/m^2, that arms exceed.

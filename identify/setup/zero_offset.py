@@ -7,8 +7,8 @@ place of the next axes, which the configuration states. The first joint's zero i
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect
 from armident.identify.effects.wiring import PositionOffset
@@ -20,8 +20,6 @@ from armident.identify.setup.plausible import LEAST_ODDS
 from armident.identify.setup.prior import MISTAKE
 from armident.identify.setup.result import SetupFinding
 from armident.identify.setup.search import LEAST_DROP, independent_rows
-
-Array = NDArray[np.float64]
 
 LEAST = float(np.radians(1.0))
 """Least offset that is a mistake, rad: homing marks and stands are right within a degree."""
@@ -88,10 +86,7 @@ class ZeroOffset:
 
 
 def zero_offset(bench: Bench, h: Hypothesis) -> ZeroOffset | None:
-    """Return the offset of one revolute joint that explains the recordings, ``None`` without one.
-
-    It gains the odds and the drop of any mistake over the set-up ``h``, with its prior, on held-out data.
-    """
+    """Return the offset of one revolute joint that explains the recordings, ``None`` without one."""
     revolute = np.array([joint.type == "revolute" for joint in bench.robot.joints])
     steps, gains, _ = _steps(bench, h)
     price = MISTAKE + float(np.log(bench.n))
@@ -129,10 +124,7 @@ def _exact(bench: Bench, h: Hypothesis, j: int, step: float) -> tuple[float, flo
 
 
 def _steps(bench: Bench, h: Hypothesis) -> tuple[Array, Array, Array]:
-    """Gauss-Newton step of each joint's offset alone, rad, its gain of the score, nats, and its deviation, (n,) each.
-
-    All parameters are free beside it; every joint counts by the power of its own residual.
-    """
+    """Gauss-Newton step of each joint's offset alone, rad, its gain of the score, nats, and deviation, (n,) each."""
     found, x = fit(bench, h), regressors(bench, h)
     residual = found.residual @ h.torque.T
     weights = np.where(bench.moving, 1.0 / np.maximum((residual**2).mean(axis=0), 1e-300), 0.0)

@@ -1,15 +1,13 @@
 """Bandpass filtering of the thesis: zero-phase Butterworth filter and central differences (section 2.3.1)."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.signals.recursive import butterworth_sections, zero_phase
 
 
-def butterworth(
-    x: NDArray[np.float64], dt: float, cutoff_hz: float, order: int = 4, padlen: int | None = None
-) -> NDArray[np.float64]:
+def butterworth(x: Array, dt: float, cutoff_hz: float, order: int = 4, padlen: int | None = None) -> Array:
     """Zero-phase Butterworth low-pass along the first axis, in second-order sections; -6 dB at the cut-off.
 
     ``padlen``: samples of odd extension at each end, by default ``3 * order`` (of one pass).
@@ -23,6 +21,6 @@ def butterworth(
     return zero_phase(sections, x, padlen)
 
 
-def central_difference(x: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+def central_difference(x: Array, dt: float) -> Array:
     """Derivative ``(x(k+1) - x(k-1)) / (2 dt)`` along the first axis, one-sided at both ends."""
     return np.gradient(x, dt, axis=0)

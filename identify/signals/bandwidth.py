@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError
 
 POWER_SHARE = 0.95
@@ -21,7 +21,7 @@ PERIODS = 50.0
 """Minimum bandwidth in periods per shortest experiment: 200 samples after the decimation of IDIM-LS."""
 
 
-def motion_bandwidth(q: Sequence[NDArray[np.float64]], dt: float) -> float:
+def motion_bandwidth(q: Sequence[Array], dt: float) -> float:
     """Bandwidth (Hz) for the choice of filters: `MARGIN` times that of the fastest joint's velocity.
 
     The encoder's noise floor is that of the upper half of the spectrum. At least `PERIODS` per shortest experiment:
@@ -39,7 +39,7 @@ def _highest(dt: float) -> float:
     return 0.04 / dt
 
 
-def _velocity_bandwidth(q: NDArray[np.float64], dt: float) -> float:
+def _velocity_bandwidth(q: Array, dt: float) -> float:
     """Frequency (Hz) below which ``POWER_SHARE`` of the fastest joint's velocity power lies; 0 if no joint moves."""
     frequency, power, position = velocity_spectra(q, dt)
     floor = _noise_floor(frequency, position, dt)
@@ -52,26 +52,24 @@ def _velocity_bandwidth(q: NDArray[np.float64], dt: float) -> float:
     return highest
 
 
-def position_noise(q: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+def position_noise(q: Array, dt: float) -> Array:
     """Standard deviation (n,) of the white noise of measured positions (N, n), rad or m."""
     frequency, _, position = velocity_spectra(q, dt)
-    noise: NDArray[np.float64] = np.sqrt(_noise_floor(frequency, position, dt) * 0.5 * dt)
+    noise: Array = np.sqrt(_noise_floor(frequency, position, dt) * 0.5 * dt)
     return noise
 
 
-def velocity_spectra(
-    q: NDArray[np.float64], dt: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def velocity_spectra(q: Array, dt: float) -> tuple[Array, Array, Array]:
     """Frequencies (F,), Hz, above 0, and spectral densities (F, n) of differences and positions over ``dt``."""
     velocity = np.diff(q, axis=0) / dt
     window = np.hanning(velocity.shape[0] + 1)[:-1, None]
     frequency = np.arange(1, velocity.shape[0] // 2 + 1) / (velocity.shape[0] * dt)
     spectrum = np.fft.rfft((velocity - velocity.mean(axis=0)) * window, axis=0)[1:]
-    power: NDArray[np.float64] = np.abs(spectrum) ** 2 * (2.0 * dt / np.sum(window**2))
+    power: Array = np.abs(spectrum) ** 2 * (2.0 * dt / np.sum(window**2))
     return frequency, power, power / (2 - 2 * np.cos(2 * np.pi * frequency * dt))[:, None]
 
 
-def _noise_floor(frequency: NDArray[np.float64], position: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+def _noise_floor(frequency: Array, position: Array, dt: float) -> Array:
     """White noise density (n,) over ``dt`` from the spectrum's upper half, whose median is log(2) of its mean."""
-    floor: NDArray[np.float64] = np.median(position[frequency >= 0.25 / dt], axis=0) / np.log(2)
+    floor: Array = np.median(position[frequency >= 0.25 / dt], axis=0) / np.log(2)
     return floor

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError
 
 STOPBAND_DB = 70.0
@@ -29,7 +30,7 @@ class Decimation:
     """
 
     factor: int
-    taps: NDArray[np.float64]
+    taps: Array
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Decimation) and (self.factor, self._bytes) == (other.factor, other._bytes)
@@ -65,7 +66,7 @@ class Decimation:
         most = max(self.factor // (WORKING_RATE // 2), 1)
         return max(k for k in range(1, most + 1) if self.factor % k == 0)
 
-    def thin(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def thin(self, x: Array) -> Array:
         """Means of ``every`` samples (N, n) around those that `of_thin` filters: without what would fold into its band.
 
         A mean has its zeros at the multiples of the new rate. The first and the last sample stand for those beyond.
@@ -87,19 +88,19 @@ class Decimation:
         """Output rows that depend on the input samples ``begin .. end - 1``, for a record without end."""
         return slice(max(0, -(-(begin - self.taps.size + 1) // self.factor)), (end - 1) // self.factor + 1)
 
-    def weights(self, rows: slice, begin: int, end: int) -> NDArray[np.float64]:
+    def weights(self, rows: slice, begin: int, end: int) -> Array:
         """Filter coefficients (rows, samples) of the input samples ``begin .. end - 1`` in output rows."""
         tap = np.arange(begin, end) - self.factor * np.arange(rows.start, rows.stop)[:, None]
         inside = (tap >= 0) & (tap < self.taps.size)
         return np.where(inside, self.taps[np.where(inside, tap, 0)], 0.0)
 
-    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(self, x: Array) -> Array:
         """Filter and decimate (N, ...) to (M, ...); DataError if the record is shorter than the filter."""
         count = self.count(x.shape[0])
         if count == 0:
             raise DataError(f"decimation by {self.factor} needs at least {self.taps.size} samples, got {x.shape[0]}")
         flat = np.ascontiguousarray(x, dtype=np.float64).reshape(x.shape[0], -1)
-        out: NDArray[np.float64] = _filtered(flat, self.taps, self.factor, count)
+        out: Array = _filtered(flat, self.taps, self.factor, count)
         return out.reshape((count, *x.shape[1:]))
 
 
@@ -120,7 +121,7 @@ def design(dt: float, cutoff_hz: float, factor: int | None = None) -> Decimation
     return Decimation(factor, taps / taps.sum())
 
 
-def _filtered(x: NDArray[np.float64], taps: NDArray[np.float64], factor: int, count: int) -> NDArray[np.float64]:
+def _filtered(x: Array, taps: Array, factor: int, count: int) -> Array:
     """Compute ``sum_i taps[i] x[factor m + i]`` for m < ``count``, as products of blocks with a banded matrix."""
     span = (_ROWS - 1) * factor + taps.size
     band = np.zeros((_ROWS, span))

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.choices import NVR_RULES, DerivativesName, NvrRule
@@ -22,23 +22,23 @@ class Derivatives:
     ``start``: time since the first recording began, s; like ``dt``, for model terms.
     """
 
-    q: NDArray[np.float64]
-    qd: NDArray[np.float64]
-    qdd: NDArray[np.float64]
-    nvr: NDArray[np.float64] | None
+    q: Array
+    qd: Array
+    qdd: Array
+    nvr: Array | None
     dt: float | None = None
     start: float = 0.0
 
 
 def differentiate(
-    q: NDArray[np.float64],
+    q: Array,
     dt: float,
     derivatives: DerivativesName = "irwsm",
-    nvr: float | Sequence[float] | NDArray[np.float64] | NvrRule | None = None,
+    nvr: float | Sequence[float] | Array | NvrRule | None = None,
     bandwidth_hz: float | None = None,
     *,
-    q_ref: NDArray[np.float64] | None = None,
-    resolution: float | Sequence[float] | NDArray[np.float64] | None = None,
+    q_ref: Array | None = None,
+    resolution: float | Sequence[float] | Array | None = None,
 ) -> Derivatives:
     """Differentiate measured positions (N, n) twice.
 
@@ -71,9 +71,7 @@ def differentiate(
     return Derivatives(q=level, qd=qd, qdd=qdd, nvr=np.array(ratios), dt=dt)
 
 
-def tracking_error_nvr(
-    error: NDArray[np.float64], order: int, resolution: float | Sequence[float] | NDArray[np.float64]
-) -> NDArray[np.float64]:
+def tracking_error_nvr(error: Array, order: int, resolution: float | Sequence[float] | Array) -> Array:
     """Noise-variance ratios (n,) approximated from the tracking error ``q_ref - q`` (N, n) (thesis 5.25 to 5.27).
 
     Order 2: variance of its difference (5.26, IRWSM 1); 3: of its second difference (5.27, IRWSM 2). ``resolution``:
@@ -84,7 +82,7 @@ def tracking_error_nvr(
         raise DataError(
             f"nvr by tracking error: the resolution of joint {int(np.argmin(step > 0)) + 1} is not positive"
         )
-    ratios: NDArray[np.float64] = (np.std(np.diff(error, n=order - 1, axis=0), axis=0) / step) ** 2
+    ratios: Array = (np.std(np.diff(error, n=order - 1, axis=0), axis=0) / step) ** 2
     if not (ratios > 0).all():
         raise DataError(
             f"nvr by tracking error: the tracking error of joint {int(np.argmin(ratios > 0)) + 1} does not vary"
@@ -92,7 +90,7 @@ def tracking_error_nvr(
     return ratios
 
 
-def encoder_resolution(robot: RobotConfig) -> NDArray[np.float64]:
+def encoder_resolution(robot: RobotConfig) -> Array:
     """Joint displacement per count of the motor encoders (n,); several motors of a joint add as root sum of squares."""
     steps = []
     for joint in robot.joints:
@@ -102,16 +100,16 @@ def encoder_resolution(robot: RobotConfig) -> NDArray[np.float64]:
             )
         steps.append((2 * np.pi if joint.type == "revolute" else 1.0) / joint.drive.counts_per_unit)
     inverse = np.linalg.inv(robot.transmission_matrix)
-    resolution: NDArray[np.float64] = np.sqrt(inverse**2 @ np.square(steps))
+    resolution: Array = np.sqrt(inverse**2 @ np.square(steps))
     return resolution
 
 
 def _ratios(
-    q: NDArray[np.float64],
+    q: Array,
     derivatives: DerivativesName,
-    nvr: float | Sequence[float] | NDArray[np.float64] | NvrRule | None,
-    q_ref: NDArray[np.float64] | None,
-    resolution: float | Sequence[float] | NDArray[np.float64] | None,
+    nvr: float | Sequence[float] | Array | NvrRule | None,
+    q_ref: Array | None,
+    resolution: float | Sequence[float] | Array | None,
 ) -> tuple[NvrRule, list[float | None]]:
     """Return the rule, and the ratio of each joint if it is already known, otherwise ``None``."""
     n = q.shape[1]
@@ -135,10 +133,10 @@ def _ratios(
     return "automatic", [float(v) for v in np.broadcast_to(ratios, (n,))]
 
 
-_Column = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], list[float]]
+_Column = tuple[Array, Array, Array, list[float]]
 
 
-def _irwsm1(y: NDArray[np.float64], dt: float, rule: NvrRule, nvr: float | None) -> _Column:
+def _irwsm1(y: Array, dt: float, rule: NvrRule, nvr: float | None) -> _Column:
     first = irwsm(y, 2, _found(y, 2, rule) if nvr is None else nvr)
     again = nvr is None and rule == "likelihood"
     second = irwsm(first.slope, 2, optimal_nvr(first.slope, 2) if again else first.nvr)
@@ -147,23 +145,23 @@ def _irwsm1(y: NDArray[np.float64], dt: float, rule: NvrRule, nvr: float | None)
     return first.level, qd, qdd, [first.nvr, second.nvr]
 
 
-def _irwsm2(y: NDArray[np.float64], dt: float, rule: NvrRule, nvr: float | None) -> _Column:
+def _irwsm2(y: Array, dt: float, rule: NvrRule, nvr: float | None) -> _Column:
     smooth = irwsm(y, 3, _found(y, 3, rule) if nvr is None else nvr)
     return smooth.level, _to_samples(smooth.slope) / dt, _extended(np.diff(smooth.slope)) / dt**2, [smooth.nvr]
 
 
-def _found(y: NDArray[np.float64], order: int, rule: NvrRule) -> float:
+def _found(y: Array, order: int, rule: NvrRule) -> float:
     if rule == "likelihood":
         return optimal_nvr(y, order)
     return cross_validated_nvr(y, order) if rule == "cross-validation" else automatic_nvr(y, order)
 
 
-def _to_samples(slope: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_samples(slope: Array) -> Array:
     """Interpolate values midway between samples (N - 1,) to the samples (N,)."""
     inner = (slope[1:] + slope[:-1]) / 2
     return np.concatenate([slope[:1], inner, slope[-1:]])
 
 
-def _extended(inner: NDArray[np.float64]) -> NDArray[np.float64]:
+def _extended(inner: Array) -> Array:
     """Extend values at the samples 1..N-2 to all N samples; each end repeats its neighbour."""
     return np.concatenate([inner[:1], inner, inner[-1:]])

@@ -4,9 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from shlex import quote
 
-import numpy as np
-from numpy.typing import NDArray
-
+from armident.arrays import Array
 from armident.configs import DataError
 
 
@@ -19,9 +17,9 @@ class Experiment:
     (negative: early); only the equations of motion are aligned with it. ``source``: path, or empty.
     """
 
-    q: NDArray[np.float64]
-    tau: NDArray[np.float64]
-    q_ref: NDArray[np.float64] | None
+    q: Array
+    tau: Array
+    q_ref: Array | None
     dt: float
     start: float = 0.0
     torque_shift: float = 0.0

@@ -14,8 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import compiled
 from armident.configs import DataError
 
@@ -35,12 +35,12 @@ class Smoothed:
     Element k of ``slope`` belongs to the instant k + 1/2.
     """
 
-    level: NDArray[np.float64]
-    slope: NDArray[np.float64]
+    level: Array
+    slope: Array
     nvr: float
 
 
-def irwsm(y: NDArray[np.float64], order: int, nvr: float) -> Smoothed:
+def irwsm(y: Array, order: int, nvr: float) -> Smoothed:
     """Smooth a series (N,), N > 2 ``order``, with the ratio ``nvr = var(kappa) / var(e)``.
 
     ``order`` 2: level and slope (IRWSM 1, 5.23); 3: and curvature (IRWSM 2, 5.24). Raises DataError if it is too short.
@@ -52,7 +52,7 @@ def irwsm(y: NDArray[np.float64], order: int, nvr: float) -> Smoothed:
     return Smoothed(level=level, slope=np.diff(level), nvr=nvr)
 
 
-def negative_log_likelihood(w: NDArray[np.float64], order: int, nvr: float) -> float:
+def negative_log_likelihood(w: Array, order: int, nvr: float) -> float:
     """Concentrated ``-2 log L`` of the noise-variance ratio, up to a constant (thesis 5.16, 5.21); diffuse start.
 
     It is ``(N - order) log(s2) + sum log nu(k)``. ``w``: ``numpy.diff(y, n=order)``, shape (N - order,).
@@ -60,7 +60,7 @@ def negative_log_likelihood(w: NDArray[np.float64], order: int, nvr: float) -> f
     return float(_profile(w, _band(order, nvr), _transient(order, nvr)))
 
 
-def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
+def optimal_nvr(y: Array, order: int, tolerance: float = 0.02) -> float:
     """Noise-variance ratio of maximum likelihood, by a bounded search on ``log10(NVR)`` (thesis 5.16, 5.21).
 
     It may follow the noise of measured positions too closely (5.3.1); see :func:`automatic_nvr`. ``tolerance``: final
@@ -72,7 +72,7 @@ def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> 
     return _search(lambda nvr: negative_log_likelihood(w, order, nvr), order, tolerance)
 
 
-def cross_validation(w: NDArray[np.float64], order: int, nvr: float) -> float:
+def cross_validation(w: Array, order: int, nvr: float) -> float:
     """Logarithm of the generalised cross-validation score of a noise-variance ratio (Craven and Wahba 1979).
 
     ``log(|y - x|^2 / N) - 2 log(tr(I - A) / N)`` with ``x = A y`` and the trace of a long series. For white noise: the
@@ -83,7 +83,7 @@ def cross_validation(w: NDArray[np.float64], order: int, nvr: float) -> float:
     return float(np.log(squares) - 2 * np.log(1 - kept_share(order, nvr)))
 
 
-def cross_validated_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
+def cross_validated_nvr(y: Array, order: int, tolerance: float = 0.02) -> float:
     """Noise-variance ratio of least generalised cross-validation score; the search is that of :func:`optimal_nvr`.
 
     It assumes white measurement noise: quantisation noise is, if the position changes by several counts per sample.
@@ -94,7 +94,7 @@ def cross_validated_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0
     return _search(lambda nvr: cross_validation(w, order, nvr), order, tolerance)
 
 
-def automatic_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
+def automatic_nvr(y: Array, order: int, tolerance: float = 0.02) -> float:
     """Noise-variance ratio for positions with unknown noise: the smaller of those of two criteria.
 
     Cross-validation is optimal for white noise, and too large for coloured noise. The likelihood of the third-order
@@ -114,7 +114,7 @@ def kept_share(order: int, nvr: float) -> float:
     return float(np.sum(-poles / (np.sqrt(-poles) * np.sqrt(4 - poles))).real / order)
 
 
-def _scaled_differences(y: NDArray[np.float64], order: int) -> NDArray[np.float64] | None:
+def _scaled_differences(y: Array, order: int) -> Array | None:
     """Differences of a series (N - order,) scaled to a maximum of 1; ``None`` if all are zero."""
     w = np.diff(_checked(y, order), n=order)
     return w / np.abs(w).max() if np.any(w) else None
@@ -141,7 +141,7 @@ def _search(criterion: Callable[[float], float], order: int, tolerance: float) -
     return float(10.0 ** ((a + b) / 2))
 
 
-def _checked(y: NDArray[np.float64], order: int) -> NDArray[np.float64]:
+def _checked(y: Array, order: int) -> Array:
     if order not in _STENCIL:
         raise ValueError(f"order: expected 2 or 3, got {order}")
     y = np.ascontiguousarray(y, dtype=np.float64)
@@ -152,7 +152,7 @@ def _checked(y: NDArray[np.float64], order: int) -> NDArray[np.float64]:
     return y
 
 
-def _band(order: int, nvr: float) -> NDArray[np.float64]:
+def _band(order: int, nvr: float) -> Array:
     """First row of the symmetric Toeplitz band of ``V = NVR I + D D'``, shape (order + 1,)."""
     stencil = _STENCIL[order]
     band = np.array([stencil[k:] @ stencil[: stencil.size - k] for k in range(order + 1)])

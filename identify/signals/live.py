@@ -10,13 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from armident.arrays import Array
 from armident.compiled import compiled
 from armident.configs import DataError
 
 PRIOR = 1e10
 """Prior variance of the derivatives at the first sample, in units of the variance of the measurement noise."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

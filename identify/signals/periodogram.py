@@ -1,9 +1,8 @@
 """Power spectra of short records: Hann window and periodogram."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from armident.arrays import Array
 
 
 def hann_window(samples: int) -> Array:

@@ -3,12 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError
 
 
-def chebyshev_decimate(
-    x: NDArray[np.float64], factor: int, order: int, ripple_db: float, padlen: int
-) -> NDArray[np.float64]:
+def chebyshev_decimate(x: Array, factor: int, order: int, ripple_db: float, padlen: int) -> Array:
     """Decimate with a zero-phase Chebyshev low-pass (type I) at 0.8 of the new Nyquist frequency.
 
     Second-order sections: one transfer function fails numerically for a ``factor`` above about 30. The samples kept are
@@ -19,7 +18,7 @@ def chebyshev_decimate(
     if x.shape[0] <= padlen:
         raise DataError(f"decimating needs more than {padlen} samples, got {x.shape[0]}")
     sections = signal.cheby1(order, ripple_db, 0.8 / factor, output="sos")
-    filtered: NDArray[np.float64] = signal.sosfiltfilt(sections, x, axis=0, padlen=padlen)
+    filtered: Array = signal.sosfiltfilt(sections, x, axis=0, padlen=padlen)
     return filtered[kept_samples(x.shape[0], factor)]
 
 

@@ -4,11 +4,10 @@ scipy.signal has them as well, but its import, with all of scipy.stats, takes a 
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from armident.arrays import Array
 from armident.compiled import ARITHMETIC, compiled
-
-Array = NDArray[np.float64]
 
 
 def recursive_filter(numerator: ArrayLike, denominator: ArrayLike, x: Array) -> Array:

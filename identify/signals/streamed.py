@@ -36,7 +36,7 @@ class OnDisk(Streamed[T]):
     """Items in a file without a name, which disappears with the sequence or the process; each is written and freed."""
 
     def __init__(self, items: Iterable[T]) -> None:
-        folder = scratch_folder()
+        folder = Path(os.environ.get("TMPDIR") or "/var/tmp")  # which is no memory disk
         self._places: list[tuple[int, list[int]]] = []
         end = 0
         try:
@@ -102,11 +102,6 @@ def chosen(items: Sequence[T], numbers: Sequence[int]) -> Sequence[T]:
     if isinstance(items, Streamed):
         return Mapped(items.__getitem__, numbers)
     return [items[k] for k in numbers]
-
-
-def scratch_folder() -> Path:
-    """Return the folder of files that do not fit in memory: ``TMPDIR``, or ``/var/tmp``, which is no memory disk."""
-    return Path(os.environ.get("TMPDIR") or "/var/tmp")
 
 
 def _not_written(folder: Path, error: OSError) -> ConfigError:

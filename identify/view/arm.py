@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.configs.schema.collision import BASE
 from armident.configs.urdf import joint_names, link_placements, mdh_of
@@ -17,8 +18,6 @@ from armident.configs.urdf_tree import read_chain
 from armident.identify.excitation.link_geometry import points_of
 from armident.identify.model_export.link_frames import LinkFrames, mdh_link_frames
 from armident.identify.model_export.source_urdf import SourceUrdf, source_frames
-
-Floats = NDArray[np.float64]
 
 FULL = 10.0
 """Unexplained torque at the bright end of the colours, standard deviations; noise alone has 1."""
@@ -37,19 +36,16 @@ class Arm:
 
     frames: LinkFrames
     revolute: tuple[bool, ...]
-    links: tuple[Floats, ...]
+    links: tuple[Array, ...]
     length: float
 
     @property
-    def axes(self) -> tuple[Floats, float, float]:
+    def axes(self) -> tuple[Array, float, float]:
         """Cylinders about the joint axes: quaternions (n, 4) that turn z to them; radius and height, m."""
         return np.stack([_onto(axis).as_quat() for axis in self.frames.axes]), self.length / 20, self.length / 8
 
-    def poses(self, q: Floats) -> tuple[Floats, Floats]:
-        """Return each link in the one before it at positions (N, n): translations (N, n, 3), quaternions (N, n, 4).
-
-        Quaternions are x, y, z, w.
-        """
+    def poses(self, q: Array) -> tuple[Array, Array]:
+        """Return each link in the one before it at q (N, n): translations (N, n, 3), quaternions xyzw (N, n, 4)."""
         translations = np.tile(self.frames.placements[:, :3, 3], (len(q), 1, 1))
         quaternions = np.empty((len(q), len(self.revolute), 4))
         for j, (placement, axis) in enumerate(zip(self.frames.placements, self.frames.axes, strict=True)):
@@ -64,12 +60,9 @@ class Arm:
 
 
 def arm_of(robot: RobotConfig, source: SourceUrdf | None) -> tuple[Arm, list[str]]:
-    """Return the arm of a URDF, else with lines between its joints, and remarks on meshes that cannot be shown.
-
-    Raises ConfigError if the URDF is wrong or of another arm.
-    """
+    """Return the arm of a URDF, else with lines between its joints, and remarks on meshes that cannot be shown."""
     frames = mdh_link_frames(robot) if source is None else source_frames(source, robot)
-    bodies: list[list[Floats]] = [[] for _ in range(robot.n + 1)]
+    bodies: list[list[Array]] = [[] for _ in range(robot.n + 1)]
     remarks = ["no URDF: the arm is shown as lines between its joints; --urdf FILE shows its links"]
     if source is not None:
         bodies, remarks = _bodies(source)
@@ -82,18 +75,18 @@ def arm_of(robot: RobotConfig, source: SourceUrdf | None) -> tuple[Arm, list[str
     return Arm(frames, tuple(joint.type == "revolute" for joint in robot.joints), links, length), remarks
 
 
-def colours(deviations: Floats) -> NDArray[np.uint8]:
+def colours(deviations: Array) -> NDArray[np.uint8]:
     """Return colours (..., 4) of unexplained torques (...) in standard deviations; cividis is perceptually even."""
     return np.asarray(colormaps["cividis"](np.clip(np.abs(deviations) / FULL, 0.0, 1.0), bytes=True))
 
 
-def _bodies(source: SourceUrdf) -> tuple[list[list[Floats]], list[str]]:
+def _bodies(source: SourceUrdf) -> tuple[list[list[Array]], list[str]]:
     """Return triangles of the base link and of each moved link in its frame, and remarks."""
     joints = read_chain(source.file, source.base, source.tip)
     names = joint_names([joint.name for joint in joints], source.file)
     placements = link_placements(joints, names, mdh_of(joints, source.file))
     found = read_shapes(source.file, source.base, source.tip)
-    bodies: dict[str, list[Floats]] = {name: [] for name in (BASE, *names)}
+    bodies: dict[str, list[Array]] = {name: [] for name in (BASE, *names)}
     unseen = list(found.missing)
     for shape in found.shapes:
         triangles = _triangles(shape)
@@ -106,7 +99,7 @@ def _bodies(source: SourceUrdf) -> tuple[list[list[Floats]], list[str]]:
     return list(bodies.values()), remarks
 
 
-def _triangles(shape: UrdfShape) -> Floats | None:
+def _triangles(shape: UrdfShape) -> Array | None:
     """Return the triangles (K, 3, 3) of a shape in its frame; ``None`` if it cannot be read or is flat."""
     if shape.mesh is not None:
         try:
@@ -129,7 +122,7 @@ def _triangles(shape: UrdfShape) -> Floats | None:
         return None
 
 
-def _hull(points: Floats) -> Floats:
+def _hull(points: Array) -> Array:
     """Return the triangles (K, 3, 3) of the convex hull of points, seen from outside counter-clockwise."""
     hull = ConvexHull(points)
     corners = points[hull.simplices]
@@ -139,18 +132,18 @@ def _hull(points: Floats) -> Floats:
     return np.asarray(corners)
 
 
-def _stick(end: Floats, radius: float) -> Floats:
+def _stick(end: Array, radius: float) -> Array:
     """Return the triangles of a thin cylinder from the origin to a point (3,)."""
     rims = [radius * _circle(8) + [0.0, 0.0, height] for height in (0.0, float(np.linalg.norm(end)))]
     return _hull(_onto(end).apply(np.concatenate(rims)))
 
 
-def _onto(axis: Floats) -> Rotation:
+def _onto(axis: Array) -> Rotation:
     """Return a rotation of z to the direction of a vector (3,)."""
     return Rotation.align_vectors(axis[None] / np.linalg.norm(axis), [[0.0, 0.0, 1.0]])[0]
 
 
-def _circle(points: int) -> Floats:
+def _circle(points: int) -> Array:
     """Return points (K, 3) on the unit circle about z."""
     angle = np.linspace(0.0, 2.0 * np.pi, points, endpoint=False)
     return np.column_stack([np.cos(angle), np.sin(angle), np.zeros(points)])

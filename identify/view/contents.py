@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.api.arguments import Progress
@@ -19,9 +20,8 @@ from armident.identify.monitoring.reidentify.summary import finding_lines
 from armident.identify.report.plots import kept_points
 from armident.identify.view.arm import FULL, Arm
 
-Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
-Signals = Mapping[str, tuple[Times, Floats]]
+Signals = Mapping[str, tuple[Times, Array]]
 
 POINTS = 20_000
 """Most points of a curve, extremes kept, and most poses and colours of the arm: an hour is as large as a minute."""
@@ -49,8 +49,8 @@ class Contents:
     robot: RobotConfig
     arm: Arm
     plots: tuple[Plot, ...]
-    poses: tuple[Times, Floats]
-    levels: tuple[Times, Floats] | None
+    poses: tuple[Times, Array]
+    levels: tuple[Times, Array] | None
     findings: str
 
 
@@ -62,10 +62,7 @@ def prediction_of(
     remarks: list[str],
     report: Progress,
 ) -> TorquePrediction | None:
-    """Return the torques of a model, by default of the identification ``beside`` the recording, if it can be used.
-
-    ``robot``: configuration of the model; ``None``: its own. ``remarks`` takes the warnings, or why there are none.
-    """
+    """Return the torques of a model, by default of the identification ``beside`` the recording, if it can be used."""
     if model is None and not (beside / "identification.json").is_file():
         remarks.append("no model, so only measured signals: give --model, or run armident identify first")
         return None
@@ -83,10 +80,7 @@ def prediction_of(
 def contents_of(
     recording: Recording, robot: RobotConfig, arm: Arm, prediction: TorquePrediction | None, diagnosis: Path
 ) -> Contents:
-    """Return the contents of a recording with predicted torques; ``diagnosis``: file of findings, which need not exist.
-
-    Raises DataError if the recording has no samples or no torque.
-    """
+    """Return the contents of a recording with predicted torques; ``diagnosis``: file of findings, if any."""
     samples = recording.samples
     if samples.sync.size < 2:
         raise DataError(f"{recording.path}: has no samples")
@@ -122,11 +116,8 @@ def contents_of(
     return Contents(robot, arm, tuple(plots), poses, levels, findings)
 
 
-def standardised(prediction: TorquePrediction) -> Floats:
-    """Return the unexplained torques (M, n) in units of their standard deviations.
-
-    Variance: that of the residuals in the identification, in their frequency bands, and that of the parameters.
-    """
+def standardised(prediction: TorquePrediction) -> Array:
+    """Return the unexplained torques (M, n) in units of their standard deviations."""
     model = prediction.model
     power = {each.joint: sum(each.band_power) for each in model.document.residual_statistics or ()}
     if len(power) < model.n:
@@ -147,7 +138,7 @@ def _plot(robot: RobotConfig, path: str, title: str, units: tuple[str, str], sig
     return Plot(path, title.format(" or ".join(used)), curves)
 
 
-def _levels(t_ns: Times, deviations: Floats) -> tuple[Times, Floats]:
+def _levels(t_ns: Times, deviations: Array) -> tuple[Times, Array]:
     width = max(round(1e9 * COLOUR_S), -(-int(t_ns[-1] - t_ns[0]) // POINTS))
     _, first, counts = np.unique((t_ns - t_ns[0]) // width, return_index=True, return_counts=True)
     return t_ns[first], np.sqrt(np.add.reduceat(deviations**2, first) / counts[:, None])
@@ -161,7 +152,7 @@ def _heading(recording: Recording) -> list[str]:
     return [f"# {recording.robot.name}: {name}", f"{size}, from {begin:%Y-%m-%d %H:%M:%S} UTC on.{torn}", ""]
 
 
-def _model_lines(prediction: TorquePrediction, deviations: Floats) -> list[str]:
+def _model_lines(prediction: TorquePrediction, deviations: Array) -> list[str]:
     document = prediction.document
     rows = [
         f"| {joint} | {document.relative_error_pct_by_joint[joint]:.2f} | {document.error_rms[joint]:.3g} {unit} "

@@ -7,8 +7,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from armident.arrays import Array
 from armident.identify.view.arm import colours
-from armident.identify.view.contents import Contents, Floats, Times
+from armident.identify.view.contents import Contents, Times
 
 GREY = (150, 150, 150, 110)
 """Colour of the links: the joints are seen through them."""
@@ -65,7 +66,7 @@ def _send(view: Contents, stream: rr.RecordingStream) -> None:
             send_columns(f"{path}/axis", view.levels[0], shades)
 
 
-def _mesh(triangles: Floats) -> rr.Mesh3D:
+def _mesh(triangles: Array) -> rr.Mesh3D:
     """Return a mesh of triangles (K, 3, 3), each with its own normal."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)

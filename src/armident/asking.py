@@ -31,10 +31,7 @@ PRINTED = 400
 
 
 def moving_session(config: Path | None) -> "SessionConfig | None":
-    """Return the session of a configuration whose arm can be moved; ``None`` for the configuration of a robot.
-
-    Raises ConfigError if the session cannot move its arm.
-    """
+    """Return the session of a configuration whose arm can be moved; ``None`` for the configuration of a robot."""
     from armident.configs import config_path
     from armident.configs.loading import is_session
     from armident.identify.monitoring.reidentify.cell import load_moving_session
@@ -54,10 +51,7 @@ def door_of(
     *,
     yes: bool,
 ) -> "Callable[[Trajectory], Recording] | None":
-    """Return what moves the robot for a command: a program, or the cell of a session; ``None`` without both.
-
-    ``robot``: configuration for recordings of a program. Raises ConfigError if nobody can be asked beforehand.
-    """
+    """Return what moves the robot for a command: a program, or the cell of a session; ``None`` without both."""
     from armident.configs import ConfigError
     from armident.identify.monitoring.reidentify.cell import Cell
 
@@ -120,10 +114,7 @@ class Program:
         self._command, self._robot, self._folder, self._rate_hz = command, robot, folder, rate_hz
 
     def __call__(self, trajectory: "Trajectory") -> "Recording":
-        """Return the file that the program leaves, imported; DataError if it refuses or leaves none.
-
-        A file of the last motion in the folder is whole, of a command that was killed: the program is not called again.
-        """
+        """Return the file that the program leaves, imported; DataError if it refuses or leaves none."""
         import numpy as np
 
         from armident.configs import DataError

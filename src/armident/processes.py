@@ -197,10 +197,7 @@ class CommandProcess:
         return ArmidentError(self._message(problem))
 
     def wait_for_line(self, text: str, timeout: float) -> str:
-        """Consume standard output up to the next line that begins with ``text``, and return that line.
-
-        Raises ProcessEnded or, after ``timeout`` (s), ProcessTimeout.
-        """
+        """Consume standard output up to the next line that begins with ``text``, and return that line."""
         until = time.monotonic() + timeout
         expected = f"before it printed {text!r}" if text else "before it printed a line"
         while True:

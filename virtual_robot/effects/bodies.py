@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import ConfigError
 from armident.virtual_robot.effects.spec import EffectSpec, Hidden, ParameterSpec, positive
 
@@ -82,7 +82,7 @@ def change_bodies(model: Any, hidden: Sequence[Hidden]) -> None:
             model.appendBodyToJoint(number, _ball(h["mass"], 0.1 * h["length"]), bob)
 
 
-def rest_angles(model: Any, hidden: Sequence[Hidden], q: NDArray[np.float64]) -> NDArray[np.float64]:
+def rest_angles(model: Any, hidden: Sequence[Hidden], q: Array) -> Array:
     """Rest angles (S,), rad, of the swinging masses in Pinocchio's order, at a posture (n,), rad or m."""
     data = model.createData()
     swinging = [h for h in hidden if h.effect == "slosh_payload"]
@@ -95,7 +95,7 @@ def rest_angles(model: Any, hidden: Sequence[Hidden], q: NDArray[np.float64]) ->
     return np.array(out)
 
 
-def hinge_damping(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
+def hinge_damping(hidden: Sequence[Hidden], gravity: Array) -> Array:
     """Viscous coefficients (S,), N m s/rad, of the swinging masses' hinges."""
     out = []
     for h in hidden:
@@ -105,11 +105,8 @@ def hinge_damping(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDA
     return np.array(out)
 
 
-def add_rotors(rotor: NDArray[np.float64], hidden: Sequence[Hidden], links: NDArray[np.float64]) -> None:
-    """Add hidden rotor inertias to ``rotor`` (n, n), joint side, in place.
-
-    Raises ConfigError if the mass matrix, with that of the ``links`` (n, n) at the start, is not positive definite.
-    """
+def add_rotors(rotor: Array, hidden: Sequence[Hidden], links: Array) -> None:
+    """Add hidden rotor inertias to ``rotor`` (n, n), joint side, in place."""
     for h in hidden:
         if h.effect == "rotor_inertia":
             one, two = (h.joint, h.joint) if h.other < 0 else (h.joint, h.other)
@@ -120,15 +117,15 @@ def add_rotors(rotor: NDArray[np.float64], hidden: Sequence[Hidden], links: NDAr
                 raise ConfigError(f"{h.where}.parameters.inertia: {h['inertia']:g} leaves a joint without inertia")
 
 
-def tilted(gravity: NDArray[np.float64], tilt: float, azimuth: float) -> NDArray[np.float64]:
+def tilted(gravity: Array, tilt: float, azimuth: float) -> Array:
     """Gravity (3,), m/s^2, in the frame of a base tilted, rad, about a horizontal axis at an azimuth from x, rad."""
     one, two = _horizontal(gravity)
     axis = math.cos(azimuth) * one + math.sin(azimuth) * two
-    out: NDArray[np.float64] = pin.exp3(tilt * axis) @ gravity
+    out: Array = pin.exp3(tilt * axis) @ gravity
     return out
 
 
-def base_vibrations(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
+def base_vibrations(hidden: Sequence[Hidden], gravity: Array) -> Array:
     """Amplitude vector (m/s^2) and angular frequency (rad/s) of each vibration of the base, shape (V, 4)."""
     one, two = _horizontal(gravity)
     rows = []
@@ -139,7 +136,7 @@ def base_vibrations(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> N
     return np.array(rows, np.float64).reshape(-1, 4)
 
 
-def _horizontal(gravity: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _horizontal(gravity: Array) -> tuple[Array, Array]:
     """Two horizontal unit vectors: the projected x axis of the base, and the vector orthogonal to it and to gravity."""
     size = float(np.linalg.norm(gravity))
     down = gravity / size if size > 0.0 else np.array([0.0, 0.0, -1.0])

@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, RobotConfig
 from armident.virtual_robot.effects.spec import AUTO, EffectSpec, Hidden, ParameterSpec, positive
@@ -57,15 +57,13 @@ def bristle_rate(row, z, qd):  # type: ignore[no-untyped-def]
     return qd - abs(qd) * z * pull, -abs(qd) * pull, 1.0 - side * z * pull * (1.0 - abs(qd) * fall / level)
 
 
-def bristle_table(
-    hidden: Sequence[Hidden], robot: RobotConfig, friction: NDArray[np.float64], inertia: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def bristle_table(hidden: Sequence[Hidden], robot: RobotConfig, friction: Array, inertia: Array) -> Array:
     """Rows (B, COLUMNS) of the bristles; Stribeck and presliding friction of one joint share a bristle.
 
     ``friction`` (n, 3 or more): fv, fc, offset of the healthy arm. ``inertia`` (n,): at the start, for critical
     damping. Raises ConfigError for a joint without Coulomb friction.
     """
-    rows: list[NDArray[np.float64]] = []
+    rows: list[Array] = []
     mine = [h for h in hidden if h.target == "bristle"]
     for j in sorted({h.joint for h in mine}):
         speed, coulomb = robot.joints[j].limits.velocity, float(friction[j, 1])

@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, Joint, RobotConfig
 from armident.virtual_robot.effects.spec import (
@@ -263,7 +263,7 @@ LOAD_CODE = CODES.index("load_dependent_friction")
 """Effect that needs the transmitted torque."""
 
 
-def force_table(hidden: Sequence[Hidden], robot: RobotConfig, friction: NDArray[np.float64]) -> NDArray[np.float64]:
+def force_table(hidden: Sequence[Hidden], robot: RobotConfig, friction: Array) -> Array:
     """Code, joint, other joint (-1: none) and parameters of each torque of `effect_torque`, (E, 3 + PARAMETERS).
 
     ``friction`` (n, 3 or more): fv, fc and offset of the healthy arm.

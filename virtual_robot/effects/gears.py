@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import PLAIN, compiled
 from armident.configs import ConfigError, RobotConfig
 from armident.virtual_robot.effects.spec import AUTO, EffectSpec, Hidden, ParameterSpec, positive
@@ -68,7 +68,7 @@ def gear_torque(row, twist, rate):  # type: ignore[no-untyped-def]
     return row[2] * (one - two) + row[3] * contact * rate, row[2] * contact, row[3] * contact
 
 
-def twist_under(row: NDArray[np.float64], torque: float) -> float:
+def twist_under(row: Array, torque: float) -> float:
     """Twist (rad or m) of a gear at rest under a torque, N m or N."""
     end = torque / float(row[2]) + math.copysign(float(row[4]), torque)
     low, high = min(0.0, end), max(0.0, end)
@@ -82,12 +82,8 @@ def twist_under(row: NDArray[np.float64], torque: float) -> float:
 
 
 def gear_rows(
-    hidden: Sequence[Hidden],
-    robot: RobotConfig,
-    rotor: NDArray[np.float64],
-    mass: NDArray[np.float64],
-    least: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    hidden: Sequence[Hidden], robot: RobotConfig, rotor: Array, mass: Array, least: Array
+) -> tuple[Array, Array]:
     """Rows (G, COLUMNS) of the elastic gears, and the inertia (G,) of the links that is assigned to each motor.
 
     The link of gear e has coordinate n + e. ``mass`` (n, n): of the links alone at the start; ``least`` (n,): least

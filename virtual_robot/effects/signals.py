@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import PLAIN, compiled
 from armident.configs import RobotConfig
 from armident.virtual_robot.effects.forces import waves
@@ -20,8 +21,6 @@ from armident.virtual_robot.effects.spec import (
     flag,
     positive,
 )
-
-Vector = NDArray[np.float64]
 
 EFFECTS: dict[str, EffectSpec] = {
     "drive_gain_error": EffectSpec(
@@ -227,28 +226,28 @@ class Signals:
                     if h[name] > 0.5:
                         origin[both], sign[both] = origin[turned], sign[turned]
 
-    def measured(self, q: Vector) -> Vector:
+    def measured(self, q: Array) -> Array:
         """Joint positions as measured by the encoders, shape (n,). ``q``: joint positions, rad or m, shape (n,)."""
         if not len(self._encoders):
             return q
-        out: Vector = _measured(q, self._encoders, self._to_joints)
+        out: Array = _measured(q, self._encoders, self._to_joints)
         return out
 
-    def applied(self, signal: Vector) -> Vector:
+    def applied(self, signal: Array) -> Array:
         """Joint torques (n,) of the motors over the next period, N m or N, from signals (n,), A, V or N m."""
-        out: Vector = _applied(signal, self._level, self._knee, self._lag, self._lagging, self._period, self._torque)
+        out: Array = _applied(signal, self._level, self._knee, self._lag, self._lagging, self._period, self._torque)
         return out
 
-    def reported(self, signal: Vector) -> Vector:
+    def reported(self, signal: Array) -> Array:
         """Signals (n,), A, V or N m, as reported now, without noise, in the drives' own order."""
         newest = -self._periods % len(self._past)
-        out: Vector = _reported(
+        out: Array = _reported(
             signal, self._past, newest, self._delay, self._leak, self._ripples, self._periods * self._period
         )
         self._periods += 1
         return out
 
-    def on_the_bus(self, signal: Vector, noise: Vector, permille: Vector, out: NDArray[np.int16]) -> None:
+    def on_the_bus(self, signal: Array, noise: Array, permille: Array, out: NDArray[np.int16]) -> None:
         """Write the reported signals (n,) with noise as int16 numbers of the bus; ``permille``: numbers per unit."""
         _permille(self.reported(signal), noise, permille, out)
 
@@ -261,7 +260,7 @@ class Signals:
         _rewired(own, self.position_from, self.position_sign, -(2**31), 2**31 - 1, out)
 
 
-def _encoder(h: Hidden, robot: RobotConfig) -> Vector:
+def _encoder(h: Hidden, robot: RobotConfig) -> Array:
     """Row of an encoder error: joint, amplitude, phase, and wave numbers over the joint positions, shape (3 + n,)."""
     joint, wave = robot.joints[h.joint], np.zeros(robot.n)
     if h["motor"] <= 0.5:

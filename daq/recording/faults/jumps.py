@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from armident.arrays import Array, Mask
 
 
 @dataclass(frozen=True)
@@ -70,10 +69,7 @@ def unwrapped(x: Array, holes: Mask, turn: float, criteria: JumpCriteria) -> tup
 
 
 def jumps(x: Array, dt: float, holes: Mask, fastest: float, hardest: float, criteria: JumpCriteria) -> Jumps:
-    """Return the jumps of a position (N,) without wraps. ``fastest``, ``hardest``: limits of velocity, acceleration.
-
-    A value that is held for several rows is judged once, at its changes.
-    """
+    """Return the jumps of a position (N,) without wraps. ``fastest``, ``hardest``: limits of velocity, acceleration."""
     wrong = np.zeros(x.size, dtype=np.bool_)
     rows = np.concatenate([[0], np.flatnonzero((np.diff(x) != 0) | holes) + 1])
     y, over_hole = x[rows], holes[rows[1:] - 1]

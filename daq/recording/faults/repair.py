@@ -6,14 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array, Mask
 from armident.configs import RobotConfig
 from armident.daq.recording.faults.jumps import JumpCriteria, jumps, unwrapped
 from armident.daq.recording.faults.stale import frozen_before, frozen_efforts, repeated_efforts
 from armident.daq.recording.faults.zeros import switched_off, zero_rows
 from armident.daq.recording.model import Gap, Quantity, Recording, Side
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 REASON = "impossible values"
 """Reason of the gaps that a repair leaves."""
@@ -159,10 +157,7 @@ def shared_steps(position: Array, steps: Sequence[tuple[int, int, float]]) -> se
 
 
 def repaired(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
-    """Return a recording with its faults repaired, the same if it has none, and a sentence for each kind.
-
-    What an import has repaired is among the sentences.
-    """
+    """Return a recording with its faults repaired, the same if it has none, and a sentence for each kind."""
     before = tuple(line for line in recording.metadata.get(REPAIRS, "").split("\n") if line)
     samples, robot = recording.samples, recording.robot
     position = samples.named("position")

@@ -3,9 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from armident.arrays import Array
 
 BITS = (7, 10, 15)
 """Bits that are signs: of one byte, of the load of Feetech and Dynamixel servos (10), of two bytes."""

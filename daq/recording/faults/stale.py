@@ -3,14 +3,12 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array, Mask
 from armident.daq.recording.faults.jumps import JumpCriteria
 from armident.daq.recording.faults.updates import resolution
 from armident.daq.recording.faults.zeros import NOTHING, runs
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Rows = tuple[int, int]
 
 MOST_CHANCE = 1e-3

@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from armident.arrays import Array
 
 LEAST_CHANGES = 50
 """Changes of a signal that tell its period: a period of every second row then errs once in 2^50 recordings."""

@@ -1,12 +1,9 @@
 """Efforts that are no measurement: zero in every row, or in rows between others that are not."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array, Mask
 from armident.daq.recording.faults.jumps import JumpCriteria
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 NOTHING = 1e-300
 """Magnitude below which an effort is 0 in every unit: memory that was never written holds such numbers."""
@@ -22,10 +19,7 @@ def never_measured(effort: Array) -> Mask:
 
 
 def zero_rows(effort: Array, holes: Mask, criteria: JumpCriteria) -> Mask:
-    """Mask (N, n) of zeros in few rows between efforts far from 0 on both sides.
-
-    Rows in which all joints are 0 count together: one of them that is far from 0 tells for all.
-    """
+    """Mask (N, n) of zeros in few rows between efforts far from 0 on both sides."""
     zero = np.abs(effort) < NOTHING
     found = np.zeros(effort.shape, dtype=np.bool_)
     used = ~zero.all(axis=0)

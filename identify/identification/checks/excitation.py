@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.estimators.reason import Level, Reason
 from armident.identify.identification.checks.judged import Judged
@@ -17,8 +17,6 @@ from armident.identify.signals.experiments import Experiment
 EXAMINED_POSTURES = 100
 """Postures of the motion, and of the workspace, at which inertia and gravity are examined: the standard error of a mean
 over 100 is a tenth of its spread between postures."""
-
-Array = NDArray[np.float64]
 
 
 def excitation(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:

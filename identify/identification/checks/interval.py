@@ -1,11 +1,12 @@
 """Check of the standard deviations: bias and serial correlation that they neglect."""
 
+from armident.arrays import Array
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.estimators.reason import Reason
 from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.equations import Prepared
 from armident.identify.identification.identification_criteria import IdentificationCriteria
-from armident.identify.identification.identification_result import Array, LeastSquares
+from armident.identify.identification.identification_result import LeastSquares
 from armident.identify.identification.options import Options
 from armident.identify.identification.simulated_bias import least_squares_bias
 from armident.identify.identification.solvers import doubts_of_serial_correlation

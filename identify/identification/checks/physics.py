@@ -1,9 +1,9 @@
 """Check of physical possibility: signs of friction and inertia, mass matrix, and the nearest possible arm."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from armident.arrays import Array
 from armident.configs import ArmidentError
 from armident.identify.estimators.reason import Reason
 from armident.identify.identification.checks.excitation import motion_postures, workspace_postures
@@ -14,8 +14,6 @@ from armident.identify.identification.support import NON_NEGATIVE
 from armident.identify.identification.verdict import enumerated
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import nearest_base
-
-Array = NDArray[np.float64]
 
 CHECK_SIGNALS = "check signs, units, sides and order of the recorded signals: armident check RECORDING"
 USE_NEAREST = (
@@ -69,10 +67,7 @@ def physics(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
 def impossible_values(
     model: ArmModel, q: Array, theta: Array, covariance: Array, criteria: IdentificationCriteria
 ) -> list[str]:
-    """Parts of a sentence on impossible values: negative friction or rotor inertia, mass matrix not positive definite.
-
-    Only what is significant counts. ``q``: postures (N, n), rad or m; ``theta`` (b,) and ``covariance`` (b, b): SI.
-    """
+    """Parts of a sentence on significant impossible values: friction, rotor inertia or mass matrix."""
     return [*_negative(model, theta, covariance, criteria), *_indefinite(model, q, theta, covariance, criteria)]
 
 

@@ -31,10 +31,7 @@ def compare_models(
     common: bool = False,
     false_alarms: float = FALSE_ALARMS,
 ) -> ComparisonDocument:
-    """Test two identifications of a robot for a change; ``common``: compare only parameters that both have.
-
-    Raises DataError if they are of different robots or models, or cannot confirm or exclude a change.
-    """
+    """Test two identifications of a robot for a change; ``common``: compare only parameters that both have."""
     (first, first_path), (second, second_path) = baseline, now
     left_out = _different(baseline, now)
     if left_out and first.robot == second.robot:

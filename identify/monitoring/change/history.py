@@ -57,10 +57,7 @@ class ParameterSeries:
 
 
 class History:
-    """Identifications in a database (SQLAlchemy URL); missing or former tables are created or upgraded.
-
-    Raises ConfigError if the database or its driver is missing, or it is locked, damaged or of a newer version.
-    """
+    """Identifications in a database (SQLAlchemy URL); missing or former tables are created or upgraded."""
 
     def __init__(self, url: str = DEFAULT) -> None:
         self.url = shown(url)
@@ -169,10 +166,7 @@ class History:
             raise ConfigError(f"{self.url}: the history cannot be written: {reason(error)}") from error
 
     def copy_to(self, other: "History") -> int:
-        """Add the runs that another history lacks, with recordings and comparisons; return their number.
-
-        All are added or none. Raises ConfigError if one cannot be read or the other not be written.
-        """
+        """Add the runs that another history lacks, with recordings and comparisons; return their number."""
         numbers = [number for (number,) in self._rows(sa.select(runs.c.id).order_by(runs.c.id))]
         try:
             with other._writing() as target:
@@ -203,10 +197,7 @@ class History:
         return True
 
     def save(self, file: Path) -> int:
-        """Write a copy to a file (SQLite), which is replaced as a whole; return the number of its runs.
-
-        Raises ConfigError if the history is empty, or the file is its own.
-        """
+        """Write a copy to a file (SQLite), which is replaced as a whole; return the number of its runs."""
         if self._engine.dialect.name == "sqlite" and Path(self._engine.url.database or "").resolve() == file.resolve():
             raise ConfigError(f"{file}: the history itself; name another file")
         temporary = file.with_name(f".{file.name}.{os.getpid()}")
@@ -230,10 +221,7 @@ class History:
         return found[0] if found else None
 
     def runs(self, robot: str | None = None, cell: str | None = None) -> list[HistoryRun]:
-        """Return identifications in the order of their recordings, of all robots and cells by default.
-
-        Arms of one type often share a name. Runs whose cell the history does not know are included.
-        """
+        """Return identifications in the order of their recordings, of all robots and cells by default."""
         return self._read(_of(robot, cell))
 
     def last(self, robot: str, cell: str | None = None) -> HistoryRun | None:

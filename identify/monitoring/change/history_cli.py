@@ -26,12 +26,7 @@ def history_command(
     *,
     as_json: bool,
 ) -> int:
-    """Carry out ``armident history``: add documents, compare runs with the first one, plot parameters.
-
-    ``documents``: files, or ``backup`` or ``restore`` and one file.
-    ``robot``: default that of the documents, or the only one. Returns 0 or `FOUND`. Raises ConfigError if an option
-    or the database is wrong, DataError if a document is wrong or of another model.
-    """
+    """Carry out ``armident history``: add documents, compare runs with the first one, plot parameters."""
     if documents and str(documents[0]) in ("backup", "restore"):
         return _copied(str(documents[0]), documents[1:], database)
     loaded = [(load_document(path, IdentificationDocument), path) for path in documents]

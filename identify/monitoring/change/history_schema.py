@@ -96,10 +96,6 @@ runs_as_stored = runs.to_metadata(sa.MetaData())
 runs_as_stored.append_column(sa.Column("repeated", sa.Integer, nullable=False))
 
 
-def _create_tables(connection: sa.Connection) -> None:
-    tables.create_all(connection)
-
-
 def _one_run_per_recording(connection: sa.Connection) -> None:
     """Mark all but the first run of each recording as repeated, and allow one that is not."""
     for statement in (
@@ -112,7 +108,7 @@ def _one_run_per_recording(connection: sa.Connection) -> None:
         connection.execute(sa.text(statement))
 
 
-MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (_create_tables, _one_run_per_recording)
+MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (tables.create_all, _one_run_per_recording)
 """Steps from version k to k + 1."""
 
 

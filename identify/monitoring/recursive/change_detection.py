@@ -3,9 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.monitoring.recursive.settings import RecursiveSettings
-
-Array = NDArray[np.float64]
 
 SPREAD_WINDOWS = 50.0
 """Memory of the spread of successive windows, in windows: of so many squares it is known to 20 %."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError
 from armident.identify.identification.equations import LS_CUTOFF
 from armident.identify.identification.torque_delay import HELD
@@ -14,8 +15,6 @@ from armident.identify.monitoring.recursive.settings import RecursiveSettings
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.decimate import design
 from armident.identify.signals.live import VelocityFilter
-
-Array = NDArray[np.float64]
 
 ROWS = 8
 """Decimated rows per piece of the stream."""

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array, Mask
 from armident.configs import RobotConfig
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.monitoring.recursive.change_detection import FrictionTest
@@ -18,9 +19,6 @@ from armident.identify.monitoring.recursive.saved_state import read_state, resto
 from armident.identify.monitoring.recursive.self_check import check_update
 from armident.identify.monitoring.recursive.settings import RecursiveSettings
 from armident.identify.monitoring.recursive.windows import Window, friction_change
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 NOMINAL_BANDWIDTH_HZ = 10.0
 """Closed-loop bandwidth where the configuration has none, Hz: that of an industrial arm (thesis section 2.3.1)."""
@@ -133,10 +131,7 @@ class RecursiveEstimator:
         self.speed_error = np.zeros((2, n))
 
     def handle(self, block: SampleBlock) -> None:
-        """Process a block of any stream: repeated rows are skipped, missing ones start the filters anew.
-
-        Raises DataError if the block has other joints than the robot, or lacks position or torque.
-        """
+        """Process a block of any stream: repeated rows are skipped, missing ones start the filters anew."""
         if self.matcher.add(block):
             self.start_capture(begun=True)
 

@@ -3,9 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.compiled import compiled
-
-Array = NDArray[np.float64]
 
 
 @compiled("f8[:, ::1], f8[:, ::1], f8[:, ::1]")

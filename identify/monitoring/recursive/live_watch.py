@@ -126,10 +126,7 @@ class LiveWatch:
                 save()
 
     def _decoded(self, data: bytes, time_ns: int) -> Block:
-        """Return the block of this robot in a message; others must not disturb the order of its blocks.
-
-        A block of an earlier capture that was signed before the newest one, ``time_ns``, is late or repeated.
-        """
+        """Return the block of this robot in a message; others must not disturb the order of its blocks."""
         self._taken += len(data)
         block = decode_block(data)
         if block.layout.joints != tuple(joint.name for joint in self._robot.joints):

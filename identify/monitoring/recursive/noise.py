@@ -5,10 +5,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.monitoring.recursive.kernels import add_residuals
 from armident.identify.monitoring.recursive.settings import RecursiveSettings
-
-Array = NDArray[np.float64]
 
 
 class RunningNoise:

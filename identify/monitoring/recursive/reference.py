@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.identify.documents.identification import IdentificationDocument
 from armident.identify.identification.torque_delay import HELD
 from armident.identify.monitoring.recursive.kernels import solve
 from armident.identify.monitoring.recursive.settings import RecursiveSettings
 from armident.identify.robot.arm import ArmModel
-
-Array = NDArray[np.float64]
 
 FRICTION = ("fv", "fc", "off")
 """Names of the friction parameters of a joint."""

@@ -6,12 +6,11 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.daq.recording import Field, StreamLayout
 from armident.identify.identification.set_points import between_set_points
 from armident.identify.monitoring.recursive.kernels import to_joint_side
-
-Array = NDArray[np.float64]
 
 EFFORTS: tuple[Literal["torque", "current", "voltage"], ...] = ("torque", "current", "voltage")
 LONGEST_WAIT = 8192
@@ -77,10 +76,7 @@ class RowMatcher:
         self.without_reference, self.repeated = 0, 0
 
     def add(self, block: SampleBlock) -> bool:
-        """Take over a block of any stream; True if another capture begins: SYNC numbers begin anew at a later time.
-
-        Raises DataError if the block has other joints than the robot, or lacks position or torque.
-        """
+        """Take over a block of any stream; True if another capture begins: SYNC numbers begin anew at a later time."""
         layout = block.layout
         names = tuple(joint.name for joint in self._robot.joints)
         if layout.joints != names:

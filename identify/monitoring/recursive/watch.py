@@ -80,10 +80,7 @@ class Screen:
 
 
 def watch_recordings(paths: Sequence[Path], config: Path | None, options: WatchOptions) -> int:
-    """Carry out ``armident watch RECORDING``; 4 after an alarm, 3 if no joint had enough excitation, otherwise 0.
-
-    Raises ConfigError or DataError if a file is wrong, or the reference does not fit.
-    """
+    """Carry out ``armident watch RECORDING``; 4 after an alarm, 3 if no joint had enough excitation, otherwise 0."""
     reference = load_document(options.reference, IdentificationDocument)
     first = read_recording(paths[0])
     robot = first.robot if config is None else load_robot(config, "identify")
@@ -125,10 +122,7 @@ def _load_state(estimator: RecursiveEstimator, path: Path | None) -> None:
 
 
 def watch_cell(config: Path | None, options: WatchOptions) -> int:
-    """Carry out ``armident watch --config SESSION`` until SIGTERM or SIGINT; 4 after an alarm, otherwise 0.
-
-    Raises ConfigError or DataError if a file is wrong, or the reference does not fit.
-    """
+    """Carry out ``armident watch --config SESSION`` until SIGTERM or SIGINT; 4 after an alarm, otherwise 0."""
     if config is None:
         raise ConfigError("give a RECORDING, or --config SESSION for the live stream of a cell")
     session = load_session(config, "identify")

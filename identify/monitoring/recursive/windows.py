@@ -5,11 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.arrays import Array
 from armident.identify.monitoring.recursive.equations import Instant
 from armident.identify.monitoring.recursive.kernels import add_products, solve
 from armident.identify.monitoring.recursive.reference import Reference
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

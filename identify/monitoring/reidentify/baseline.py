@@ -38,10 +38,7 @@ def doubt_of(document: IdentificationDocument) -> str:
 
 
 def baseline_of(file: Path | None, history: History | None, robot: str, cell: str) -> Baseline:
-    """Baseline of the robot in a cell: the file, else the first run in the history.
-
-    Raises ConfigError if the history has runs but the file is missing (a misspelt name), DataError if it does not fit.
-    """
+    """Baseline of the robot in a cell: the file, else the first run in the history."""
     first = None if history is None else history.first(robot, cell)
     if file is None:
         if first is None:

@@ -41,11 +41,7 @@ class Cell:
     start: Start = start_process
 
     def __call__(self, trajectory: Trajectory) -> Recording:
-        """Play a trajectory once under the guard, unless ``folder`` has its whole recording already.
-
-        Raises ConfigError if the bus is not as configured, MotionStopped if the guard stopped the drives,
-        Interrupted, or ArmidentError: never DataError, which asks for another motion.
-        """
+        """Play a trajectory once under the guard, unless ``folder`` has its whole recording already."""
         file = self._file_of(trajectory)
         newest = max(self.folder.glob("*.mcap"), key=lambda path: path.stat().st_mtime_ns, default=None)
         if newest is not None and (recording := _whole(newest, file)) is not None:

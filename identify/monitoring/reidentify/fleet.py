@@ -70,10 +70,7 @@ class Row:
 
 @dataclass
 class _Baselines:
-    """The given baseline, or that of each arm, which an older recording that follows must not replace.
-
-    Documents stay in the history: ten thousand are gigabytes.
-    """
+    """The given baseline, or that of each arm, which an older recording that follows must not replace."""
 
     given: IdentificationDocument | None
     history: History
@@ -95,11 +92,7 @@ class _Baselines:
 
 
 def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> int:
-    """Carry out ``armident reidentify --recordings``; a failed recording does not stop the others.
-
-    Each is compared with the baseline, or the first run of the arm (robot and cell). Returns 0, `FOUND` or 1.
-    Raises ConfigError if nothing matches, there are no workers, or metrics are asked for.
-    """
+    """Carry out ``armident reidentify --recordings``; a failed recording does not stop the others."""
     if asked.metrics is not None:
         raise ConfigError("--metrics: not with --recordings; the results of a fleet are in the history (--store)")
     paths = matching(pattern)
@@ -141,10 +134,7 @@ def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> i
 def identified(
     client: "Client", tasks: Sequence[tuple[str, RobotConfig | None, str]]
 ) -> "Iterator[Identified | ArmidentError]":
-    """Yield the result or error of each task (`identify_one`) in order.
-
-    Each is fetched as soon as it is there, as a worker that ends takes with it what it still holds.
-    """
+    """Yield the result or error of each task (`identify_one`) in order."""
     from distributed import as_completed
 
     futures = [client.submit(identify_one, *task, pure=False) for task in tasks]

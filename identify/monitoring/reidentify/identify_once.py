@@ -73,11 +73,7 @@ def identify_once(
     publisher: StatusPublisher,
     say: Say,
 ) -> OnceIdentified:
-    """Identify a recording and announce the result, unless a worker does it; then wait for its result.
-
-    Without a writable ledger the result is announced all the same. Raises DataError if it cannot be identified,
-    ArmidentError if it cannot be written.
-    """
+    """Identify a recording and announce the result, unless a worker does it; then wait for its result."""
     path = recording.path
     beside = [] if path is None else captured_in((path.parent,), robot.name)
     files = [each for each in beside if path is not None and path.resolve() in each.paths]

@@ -34,10 +34,7 @@ JOB = Metrics(
 
 @contextmanager
 def reported(path: Path | None, config: Path, say: Say) -> Iterator[dict[str, Value]]:
-    """Yield the values of a job, and write them at the end of the block to a file, if any, also after an error.
-
-    Raises ConfigError if the file cannot be written. Without a session that can be loaded there is no file.
-    """
+    """Yield the values of a job, and write them at the end of the block to a file, if any, also after an error."""
     values: dict[str, Value] = {}
     if path is None:
         yield values

@@ -39,11 +39,7 @@ class Interrupted(ArmidentError):
 
 
 def record_run(config: Path, out: Path, say: Say, start: Start = start_process) -> Recording:
-    """Play the set points of a session once under a guard and return the recording, which is always kept.
-
-    Raises ConfigError if the bus is not as configured, MotionStopped if the guard stopped the drives, Interrupted, or
-    ArmidentError if the capture failed.
-    """
+    """Play the set points of a session once under a guard and return the recording, which is always kept."""
     # The guard runs from before the first motion until after the last.
     with _interruptible(), running(["guard", "--config", str(config)], start) as guard:
         _until_ready(guard)

@@ -19,10 +19,7 @@ RUNS_PER_FILE = 100
 
 
 class ResultsTable:
-    """Adds files to a folder that other processes may add to and read; each is written, then named.
-
-    Raises ConfigError if PyArrow is missing or the folder cannot be written.
-    """
+    """Adds files to a folder that other processes may add to and read; each is written, then named."""
 
     def __init__(self, folder: Path) -> None:
         require("--results", "parquet")

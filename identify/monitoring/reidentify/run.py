@@ -92,10 +92,7 @@ class Outcome:
 
 
 def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
-    """Carry out ``armident reidentify`` without ``--recordings``; returns 0 or `FOUND`.
-
-    Raises ConfigError, DataError or ArmidentError if an input is wrong, or motion or identification fail.
-    """
+    """Carry out ``armident reidentify`` without ``--recordings``; returns 0 or `FOUND`."""
     for option, given in (
         ("--scheduler", asked.scheduler),
         ("--workers", asked.workers),
@@ -126,10 +123,7 @@ def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
 
 
 def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, false_alarms: float) -> Job:
-    """Load and check the inputs of a job; by default the first run in the history is the baseline.
-
-    Raises ConfigError if set points are missing or beyond limits, DataError if the baseline does not fit.
-    """
+    """Load and check the inputs of a job; by default the first run in the history is the baseline."""
     session = load_moving_session(config)
     robot = load_robot(session.robot)
     history, warning = history_or_reason(store, needed=baseline is None or not baseline.exists())
@@ -140,10 +134,7 @@ def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, f
 
 
 def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Baseline) -> None:
-    """Check a trajectory against the limits of motion and, predicted with a baseline, of torque.
-
-    Raises ConfigError with joint and limit if one is exceeded, DataError if the baseline is of another model.
-    """
+    """Check a trajectory against the limits of motion and, predicted with a baseline, of torque."""
     assert session.setpoints is not None
     name = str(session.setpoints.trajectory)
     trajectory = load_trajectory(session.setpoints.trajectory)
@@ -161,10 +152,7 @@ def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Basel
 
 
 def carry_out(job: Job, announcer: StatusPublisher, say: Say, values: dict[str, Value] | None = None) -> Outcome:
-    """Carry out a job, store its result in the history, and publish it; raises ArmidentError if it fails.
-
-    ``values``: takes those of the metrics of the job.
-    """
+    """Carry out a job, store its result in the history, and publish it; raises ArmidentError if it fails."""
     values = {} if values is None else values
     say(f"{job.robot.name} in cell {job.session.cell}; baseline: {job.baseline.name}")
     if job.warning is not None:
@@ -237,10 +225,7 @@ def _unexpected(
     announcer: StatusPublisher,
     say: Say,
 ) -> Outcome:
-    """Outcome of a run that cannot be compared: changed if the diagnosis against the baseline finds why.
-
-    The same motion gave a usable baseline. Exchanged signals, for example, leave no usable parameters at all.
-    """
+    """Outcome of a run that cannot be compared: changed if the diagnosis against the baseline finds why."""
     # The diagnosis decides what the comparison left open.
     defect = defect.removesuffix(": whether the arm has changed is unknown")
     unknown = DataError(f"{recording.path}: {defect}: whether the arm has changed is unknown (result: {path})")

@@ -30,7 +30,8 @@ _MEANINGS = {
 def change_lines(drift: ParameterChangeTest, robot: RobotConfig) -> list[str]:
     """One line per change of the plant, parameter, group and residual, or one for all parameters together."""
     lines = [f"{' and '.join(found.change.joints)}: {found.words}" for found in drift.explained]
-    lines += [_line(drift, name, robot) + f", p = {_p_text(_p_value(drift, name))}" for name in drift.changed]
+    p_values = {each.name: float(p) for each, p in zip(drift.parameters, drift.p_values, strict=True)}
+    lines += [_line(drift, name, robot) + f", p = {_p_text(p_values[name])}" for name in drift.changed]
     for group in drift.changed_groups:
         rest = [name for name in group.members if name not in drift.changed]
         if len(rest) == len(group.members):
@@ -62,10 +63,6 @@ def _line(drift: ParameterChangeTest, name: str, robot: RobotConfig) -> str:
         f"{place_of(name, robot)}: {meaning_of(name)} {name} {before:.4g} -> {parameter.value:.4g} "
         f"{parameter.unit}{share}, {_deviations(drift, name):.1f} standard deviations"
     )
-
-
-def _p_value(drift: ParameterChangeTest, name: str) -> float:
-    return next(float(p) for each, p in zip(drift.parameters, drift.p_values, strict=True) if each.name == name)
 
 
 def finding_lines(diagnosis: DiagnosisDocument) -> list[str]:

@@ -10,6 +10,7 @@ from armident.configs.units import counts_per_si
 from armident.virtual_robot import inertias
 from armident.virtual_robot.model import build_model, pin
 from armident.virtual_robot.plant import Plant
+from tests.tools import tx40_inertias
 
 PERIOD = 200e-6
 
@@ -21,7 +22,7 @@ def tx40() -> RobotConfig:
 
 def test_solving_again_gives_the_stored_link_parameters(tx40: RobotConfig) -> None:
     stored = inertias.plant_parameters(tx40)
-    for name, value in inertias.solve_inertias().items():
+    for name, value in tx40_inertias.solve_inertias().items():
         # The solver stops at a relative gap of 1e-8; only values that are fixed by table B.4 are that sharp.
         assert stored[name] == pytest.approx(value, abs=1e-4), name
 
@@ -29,7 +30,7 @@ def test_solving_again_gives_the_stored_link_parameters(tx40: RobotConfig) -> No
 def test_every_link_is_a_body_that_can_exist(tx40: RobotConfig) -> None:
     stored = inertias.plant_parameters(tx40)
     for link in range(1, 7):
-        assert np.linalg.eigvalsh(inertias.pseudo_inertia(stored, link)).min() > 5e-6
+        assert np.linalg.eigvalsh(tx40_inertias.pseudo_inertia(stored, link)).min() > 5e-6
         assert stored[f"ia{link}"] > 0
     assert 15 < sum(stored[f"m{link}"] for link in range(1, 7)) < 27
 
@@ -37,11 +38,11 @@ def test_every_link_is_a_body_that_can_exist(tx40: RobotConfig) -> None:
 def test_the_essential_values_of_table_b4_are_met(tx40: RobotConfig) -> None:
     base = inertias.base_parameters(inertias.plant_parameters(tx40))
     assert len(base) == 40
-    for name, value in inertias.ESSENTIAL.items():
+    for name, value in tx40_inertias.ESSENTIAL.items():
         assert base[name] == pytest.approx(value, abs=1e-7), name
-    for name, (value, std) in inertias.WITHIN_STD.items():
+    for name, (value, std) in tx40_inertias.WITHIN_STD.items():
         assert abs(base[name] - value) <= std, name
-    rest = set(base) - set(inertias.ESSENTIAL) - set(inertias.WITHIN_STD)
+    rest = set(base) - set(tx40_inertias.ESSENTIAL) - set(tx40_inertias.WITHIN_STD)
     # The thesis calls these not significant: below the 0.01 that its smallest essential value has.
     assert max(abs(base[name]) for name in rest) < 1e-3
 

@@ -16,7 +16,6 @@ from armident.virtual_robot import servo
 from armident.virtual_robot.arm import Arm
 from armident.virtual_robot.arm_parameters import arm_parameters, with_scenario
 from armident.virtual_robot.drawn_parameters import TORQUE_SHARE, draw_bodies, torque_scale
-from armident.virtual_robot.inertias import pseudo_inertia
 from armident.virtual_robot.offline import effort_of, simulate_recording
 from armident.virtual_robot.plant import Plant
 from armident.virtual_robot.plausible_motion import plausible_trajectory
@@ -31,6 +30,7 @@ from armident.virtual_robot.twin import (
     write_twin,
 )
 from tests.fixtures.other_arms import write_scara
+from tests.tools.tx40_inertias import pseudo_inertia
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,8 @@ from armident.identify.documents.base import plain
 from armident.identify.documents.diagnosis import BeforeAfter, DiagnosisDocument, Gap, Gaps
 from armident.identify.documents.files import from_json, load_document, to_json, write_atomically
 from armident.identify.documents.identification import IdentificationDocument, parameter
-from armident.identify.documents.schemas import SCHEMA_FILES, schema_text
 from tests.evaluation.schema import SuiteConfig
+from tests.tools.json_schemas import SCHEMA_FILES, schema_text
 from tests.unit.daq.test_recording import make_recording
 
 
@@ -46,7 +46,7 @@ def diagnosis() -> DiagnosisDocument:
 @pytest.mark.parametrize("name", sorted(SCHEMA_FILES))
 def test_shipped_schema_is_the_one_of_the_code(name: str) -> None:
     text = (Path(configs.__file__).parent / "json_schemas" / name).read_text(encoding="utf-8")
-    assert text == schema_text(SCHEMA_FILES[name]), "run: python -m armident.identify.documents"
+    assert text == schema_text(SCHEMA_FILES[name]), "run: python -m tests.tools.json_schemas"
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""JSON Schemas of the result documents, files in ``configs/json_schemas``."""
+"""JSON Schemas of the result documents: ``python -m tests.tools.json_schemas`` writes ``configs/json_schemas``."""
 
 import json
 from pathlib import Path
@@ -40,3 +40,7 @@ def write_schemas() -> None:
     """Write the schema files of all documents."""
     for name, kind in SCHEMA_FILES.items():
         write_atomically(Path(configs.__file__).parent / "json_schemas" / name, schema_text(kind))
+
+
+if __name__ == "__main__":
+    write_schemas()

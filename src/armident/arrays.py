@@ -1,0 +1,8 @@
+"""Types of arrays that are used everywhere."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
