@@ -53,7 +53,10 @@ class BaselineStage:
         return self.sought == ()
 
     def beside(self, structural: Sequence[Finding], joints: Sequence[str]) -> list[Finding]:
-        """Findings of changes, without those of joints at which something was left and has a structural name now."""
+        """Findings of changes, without those of joints at which something was left and has a structural name now.
+
+        The parameters there follow the effect that the model lacks.
+        """
         sought = {joints[j] for j in self.sought or ()}
         superseded = sought & {f.joint for f in structural if f.effect != UNNAMED}
         return [f for f in self.findings if f.joint not in superseded]
@@ -71,7 +74,10 @@ class BaselineStage:
 
 
 def against_baseline(stage: SetupStage, baseline: IdentificationDocument, criteria: Criteria) -> BaselineStage:
-    """Compare the recordings of a diagnosis with a baseline, and explain what has changed."""
+    """Compare the recordings of a diagnosis with a baseline, and explain what has changed.
+
+    Raises DataError if the baseline is of another robot or model.
+    """
     robot, experiments = _as_identified(stage.robot, baseline), [*stage.training, *stage.validation]
     # Of a document that is not stored; the test needs the length.
     samples = sum(e.q.shape[0] for e in experiments)
@@ -259,7 +265,10 @@ class _Described:
         return list(found.values())
 
     def _worse(self, after: Gap) -> set[int]:
-        """Joints of another motion than the baseline's with much larger residuals or errors after the changes."""
+        """Joints of another motion than the baseline's with much larger residuals or errors after the changes.
+
+        Their functions of the motion are not compared.
+        """
         if not self.test.residuals.reason:
             return set()
         before = {each.joint: each for each in self.baseline.residual_statistics or ()}

@@ -106,7 +106,10 @@ class SelectionStep:
 def compared_candidates(
     state: ModelState, made: Sequence[FittedCandidate], tests: int, passes: Callable[[Addition, int], bool]
 ) -> SelectionStep:
-    """Compare models with candidates, all under the noise models of the most likely one that physics allows."""
+    """Compare models with candidates, all under the noise models of the most likely one that physics allows.
+
+    Those of a residual without smooth functions of the motion; else they would take missing effects for noise.
+    """
     noise = _noise_of_best([state, *(m.state for m in made if m.allowed)])
     alike = state.under(noise)
     ranked = tuple(sorted((_compared(alike, m, noise) for m in made), key=lambda a: -a.log_likelihood))

@@ -148,7 +148,10 @@ class ColumnCache:
 
 
 def candidates(column_cache: ColumnCache) -> Iterator[Candidate]:
-    """All effects with terms of their own that the robot does not have at a place yet, and that this motion excites."""
+    """All effects that the robot does not have at a place yet, and that this motion excites.
+
+    Without effects that only change parameters, and exchanges of signals.
+    """
     study = column_cache.study
     motion = column_cache.motion(study.train[0], "measured")
     names = study.joints

@@ -76,7 +76,10 @@ class ParameterChangeTest:
 
     @property
     def share(self) -> float:
-        """False-alarm rate of each test: all parameters together; single ones and groups; then those that were made."""
+        """False-alarm rate of each test: all parameters together; single ones and groups; then those that were made.
+
+        They are the residuals and the changes of the catalogue.
+        """
         return self.false_alarms / (2 + bool(self.residuals.tests) + (self.p_changes is not None))
 
     @property
@@ -164,7 +167,10 @@ def compare(
     robot: RobotConfig | None = None,
     criteria: Criteria | None = None,
 ) -> ParameterChangeTest:
-    """Test two identifications of an arm with the same model for a change of its parameters."""
+    """Test two identifications of an arm with the same model for a change of its parameters.
+
+    Changed parameters of a ``robot`` are explained. Raises DataError and Inconclusive as `difference_of`.
+    """
     criteria = criteria or Criteria()
     difference = difference_of(baseline, now)
     if "doubtful" in (baseline.verdict, now.verdict) and not same_motion(baseline, now):

@@ -166,7 +166,10 @@ class Competition:
         return Attribution(self.difference, changes, rest, p_rest, unexplained, share)
 
     def _within_first_order(self, found: Sequence["Whitened"], best: "Whitened") -> bool:
-        """True if a further change takes no more than what the directions of the others leave of large changes."""
+        """True if a further change takes no more than what the directions of the others leave of large changes.
+
+        Those of parameters are exact. The others hold for small changes, and for noise models without them.
+        """
         if all(one.change.scores is None for one in found):
             return False
         whole = float(self.target @ self.target)
@@ -246,7 +249,10 @@ class Whitened:
 
 
 def _prior(change: Change, pool: Sequence[Change], criteria: Criteria) -> float:
-    """Logarithm of the prior odds, divided among the places of an effect."""
+    """Logarithm of the prior odds, divided among the places of an effect.
+
+    Loads of the flange, friction and offsets change more often than the rest, and loads of other links less.
+    """
     alike = [c for c in pool if c.effect == change.effect]
     common = criteria.close if isinstance(change.effect, ParameterChange) else 0.0
     if not isinstance(change.effect, Payload):
@@ -255,7 +261,10 @@ def _prior(change: Change, pool: Sequence[Change], criteria: Criteria) -> float:
 
 
 def _evidence(target: Array, columns: Array) -> tuple[float, float]:
-    """Logarithm of the likelihood of whitened differences (r,) with one change of the best size, and this size."""
+    """Logarithm of the likelihood of whitened differences (r,) with one change of the best size, and this size.
+
+    The variance of the rest is the larger of 1 and its mean square.
+    """
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
     kept = s > RANK_TOLERANCE * max(float(s.max(initial=0.0)), 1e-300)
     along, s = u[:, kept].T @ target, s[kept]
@@ -275,7 +284,10 @@ def _log_likelihood(square: float, count: int) -> float:
 
 
 def _whitened_by(target: Array, found: Sequence[Whitened]) -> tuple[Array, float]:
-    """Matrix (r, r) that whitens the difference with some changes of their best sizes, and half its log determinant."""
+    """Matrix (r, r) that whitens the difference with some changes of their best sizes, and half its log determinant.
+
+    The sizes are those of all changes together: alone, one would take the size of another, too.
+    """
     sizes = [0.0] * len(found)
     for _ in range(SWEEPS if len(found) > 1 else 1):
         before = list(sizes)

@@ -69,7 +69,10 @@ class Confirmation:
 
     @property
     def reduction(self) -> float:
-        """Mean logarithm of the factors by which the errors of each joint and of the whole arm fall, nats."""
+        """Mean logarithm of the factors by which the errors of each joint and of the whole arm fall, nats.
+
+        The norm of all alone would judge the largest joint.
+        """
         before, after = np.append(self.before, self.whole_before), np.append(self.best, self.whole_after)
         return float(np.mean(np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))))
 
@@ -79,7 +82,11 @@ class Confirmation:
         return self.reduction > 0.0
 
     def is_material(self, criteria: Criteria, *, named: bool) -> bool:
-        """True if errors of a joint fall by enough beside its torque; of an unnamed term by `material_pct`."""
+        """True if the errors of one joint on which it acts fall by enough, relative to them and to its torque.
+
+        Motions that do not show an effect say nothing of its size: one recording is enough. A term without a name is
+        lack of fit, and judged as that: the error itself falls by `material_pct`.
+        """
         before, best = self._errors_of_recordings
         fall = np.maximum(before**2 - best**2, 0.0)
         size = np.sqrt(fall) if named else before - best

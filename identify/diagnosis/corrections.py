@@ -59,7 +59,10 @@ def _at_simulated(
 
 
 def _likelihoods(fit: IvFit, effect: Correction, motor: int, limit: float, values: Sequence[float]) -> Array:
-    """Twice the log-likelihood (k,) of the torques corrected for each value, without a constant."""
+    """Twice the log-likelihood (k,) of the torques corrected for each value, without a constant.
+
+    Parameters and the noise model of the motor's joint are estimated again: a strong correction changes its spectrum.
+    """
     study, transmission = fit.study, fit.study.robot.transmission_matrix
     own = [s.torque @ np.linalg.inv(transmission)[:, motor] for s in study.train]
     size = PERTURBATION * float(np.concatenate(own).std())

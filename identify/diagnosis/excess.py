@@ -188,7 +188,10 @@ def about_reversals(moving: NDArray[np.bool_], qd: Array, slow: float) -> NDArra
 def bursts(
     series: Sequence[Array], times: Sequence[Array], velocities: Sequence[Array], slow: float = 0.0
 ) -> Excess | None:
-    """Moments with more power than the others, of the residual (M,) of one joint with its times and velocities (M,)."""
+    """Moments with more power than the others, of the residual (M,) of one joint with its times and velocities (M,).
+
+    Times about rest, reversals and under the velocity ``slow``, where dry friction has no model, are left out.
+    """
     powers, moments = [], []
     for e, t, qd in zip(series, times, velocities, strict=True):
         count = e.size // WINDOW

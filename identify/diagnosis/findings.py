@@ -21,7 +21,10 @@ from armident.identify.effects.wiring import SignalMistake
 
 
 def findings_of(final: ModelState, selected: Sequence[Selected], left: Sequence[Unexplained]) -> list[Finding]:
-    """Return the findings of a selection, in its order; `judged` gives them their probabilities."""
+    """Return the findings of a selection, in its order; `judged` gives them their probabilities.
+
+    ``selected``: effects of the selection. ``left``: dependences of the residual with them.
+    """
     deviations = standard_deviations(final)
     entries = list(final.robot.effects)
     values = final.with_values().effects
@@ -98,7 +101,10 @@ def _known_shares(left: Sequence[Unexplained]) -> dict[str, float]:
 
 
 def tempered_odds(step: SelectionStep, one: Addition) -> dict[Key, float]:
-    """Return the posterior odds of each other effect in place of one, whatever its law, with equal prior odds."""
+    """Return the posterior odds of each other effect in place of one, whatever its law, with equal prior odds.
+
+    Differences of log-likelihood are reduced by the serial correlation that the noise models leave.
+    """
     factor = float(np.clip(one.gain / one.raw_gain, 0.0, 1.0)) if one.raw_gain > 0.0 else 1.0
     odds: dict[Key, float] = {}
     for rival in step.rivals(one):
@@ -125,7 +131,10 @@ def negligible(
     immaterial: Sequence[Addition],
     dependences: Sequence[tuple[ResidualDependence, float]],
 ) -> list[Negligible]:
-    """Return what is significant and no cause: too small, or within the sampling convention of drives."""
+    """Return what is significant and no cause: too small, or within the sampling convention of drives.
+
+    ``dependences``: of residuals, with the fall of the error without them, percent.
+    """
     found: dict[Key, Negligible] = {}
     small = [*(one.addition for one in conventional), *immaterial]
     if step is not None:
@@ -181,7 +190,10 @@ def noise_floor(final: ModelState, left: Sequence[Unexplained]) -> Gap:
 
 
 def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
-    """Return the effects that this motion cannot show at some joint, with the reason."""
+    """Return the effects that this motion cannot show at some joint, with the reason.
+
+    ``hidden``: effects and places that the model contains or the motion does not excite.
+    """
     study = state.study
     motion = ColumnCache(study, state.fit.theta).motion(study.train[0], "measured")
     found: dict[tuple[str, str], NotVisible] = {}

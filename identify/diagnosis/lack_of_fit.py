@@ -126,7 +126,10 @@ class LackOfFit:
 
     @cached_property
     def unexplained(self) -> tuple[ResidualDependence, ...]:
-        """Significant and material dependences, each in addition to the ones before it, largest share first."""
+        """Significant and material dependences, each in addition to the ones before it, largest share first.
+
+        So a variable correlated with a stronger one (speed with torque, for example) is not listed again.
+        """
         found: list[ResidualDependence] = []
         for j, own in enumerate(self.joints):
             mine = [p for p in self.projections if p.joint == j and self._reported(p)]
@@ -177,7 +180,10 @@ class LackOfFit:
         return large and self._significant(test)
 
     def _fall(self, test: Projection | SpectralLine | Excess, joint: int) -> float:
-        """By how much the error of a joint falls without a dependence, percent of its torque."""
+        """By how much the error of a joint falls without a dependence, percent of its torque.
+
+        It is that of the recording that shows it most: others need not move as it needs.
+        """
         torque = np.concatenate([s.torques[:, joint] for s in self.fit.study.train])
         if isinstance(test, SpectralLine):
             fall = test.size
@@ -338,7 +344,10 @@ class LackOfFit:
 
     @cached_property
     def tests(self) -> int:
-        """Number of all tests: sets of functions, and seven of each joint."""
+        """Number of all tests: sets of functions, and seven of each joint.
+
+        These are all functions together, a line, two of spectra, two of bursts, and errors larger than before.
+        """
         return sum(len(own) + 7 for own in self.functions)
 
     def _whitened(self, fit: IvFit) -> tuple[JointResidual, ...]:
@@ -409,7 +418,10 @@ def _fall_of_error(error: Array, change: Array, away: Array) -> float:
 
 
 def _refitted(errors: Sequence[Array], regressors: Sequence[Array]) -> list[Array]:
-    """Errors (M,) of a joint without what other parameters of the model explain, whose regressors are (M, b)."""
+    """Errors (M,) of a joint without what other parameters of the model explain, whose regressors are (M, b).
+
+    Errors of the parameters give the residual of other data the spectrum of the motion.
+    """
     x, e = np.concatenate(regressors), np.concatenate(errors)
     x = x / np.maximum(np.linalg.norm(x, axis=0), 1e-300)
     left = e - x @ np.linalg.lstsq(x, e, rcond=RANK)[0]
@@ -417,7 +429,10 @@ def _refitted(errors: Sequence[Array], regressors: Sequence[Array]) -> list[Arra
 
 
 def limited(residual: Array, joints: Sequence[slice], deviations: float) -> Array:
-    """Return whitened residuals (R,) limited to a number of robust standard deviations of each joint."""
+    """Return whitened residuals (R,) limited to a number of robust standard deviations of each joint.
+
+    Signs of measured velocities are uncertain at reversals: a few errors of dry friction would outweigh all others.
+    """
     found = residual.copy()
     for rows in joints:
         own = residual[rows]

@@ -117,7 +117,10 @@ Fitter = Callable[[RobotConfig, ModelState], ModelState | None]
 
 
 def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> ModelState:
-    """Fit the model of a configuration in its own closed loop, with torques and noise models of ``before``."""
+    """Fit the model of a configuration in its own closed loop, with torques for terms and noise models of ``before``.
+
+    ``None``: fit a rigid model first, and alternate between parameters and noise models.
+    """
     changed = study.of_robot(robot)
     model = changed.model
     theta: Array | None = None
@@ -161,7 +164,10 @@ def without_entry(robot: RobotConfig, entry: Entry) -> RobotConfig:
 
 
 def with_own_noise(state: ModelState) -> ModelState:
-    """Return a model fitted with the noise models of its own residual, if it predicts with smaller errors."""
+    """Return a model fitted with the noise models of its own residual, in which no effect should be missing any more.
+
+    It stays as it is if it predicts with smaller errors: mean of their logarithms, as joints differ in size.
+    """
     own = ModelState(safe(state.fit.renoised(state.own_noise)))
     sizes = (float(np.log(np.maximum(one.score.rms, 1e-300)).sum()) for one in (own, state))
     return own if next(sizes) < next(sizes) else state
@@ -206,7 +212,10 @@ def acted_on(with_it: ModelState, without: ModelState) -> NDArray[np.bool_]:
 
 
 def _iterated(found: IvFit) -> IvFit:
-    """Fit whose terms scale the torques predicted by the model itself, by iteration."""
+    """Fit whose terms scale the torques predicted by the model itself, by iteration.
+
+    A drive that gives half its torque scales another torque than the model without it predicts.
+    """
     terms = slice(found.study.model.base.b - found.study.model.e, None)
     for _ in range(ITERATIONS):
         before, std = found.theta[terms], np.sqrt(np.diag(found.covariance)[terms])

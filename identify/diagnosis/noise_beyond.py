@@ -91,7 +91,10 @@ def noise_beyond_shapes(fit: IvFit, column_cache: ColumnCache) -> list[ArModel]:
 
 
 def noise_sizes(fit: IvFit, column_cache: ColumnCache) -> Array:
-    """Size of the noise of each training stretch and joint beside that of all stretches, (S, n); 1 for few rows."""
+    """Size of the noise of each training stretch and joint beside that of all stretches, (S, n); 1 for few rows.
+
+    The rest that smooth functions of the motion leave is larger in one motion than in another, as all models err.
+    """
     parts, _ = _beyond_shapes(fit, column_cache)
     noise = ar_models(parts, MAX_AR_ORDER)
     rows = np.array([np.count_nonzero(s.moving, axis=0) for s in fit.study.train])

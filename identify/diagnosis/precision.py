@@ -44,7 +44,10 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
 
 
 def p_value_of_effect(state: ModelState, entry: Entry) -> float:
-    """Probability of linear parameters of an effect so far from zero if it is not there (Wald's test)."""
+    """Probability of linear parameters of an effect so far from zero if it is not there (Wald's test).
+
+    Its own nonlinear parameters are fixed: without it, they mean nothing. A likelihood can rise without such evidence.
+    """
     number = list(state.robot.effects).index(entry)
     every, owners = _further_columns(state)
     slopes = [slope for slope, (owner, _) in zip(every, owners, strict=True) if owner != number]

@@ -105,7 +105,10 @@ class PredictiveScore:
 
     @property
     def _changes(self) -> Sequence[Array | None]:
-        """Parameters of each fold less the reference of a joint, (`FOLDS`, b); ``None`` without one."""
+        """Parameters of each fold less the reference of a joint, (`FOLDS`, b); ``None`` without one.
+
+        The first model has no effects: the reference of theirs is zero.
+        """
         study = self.fit.study
         rigid = self.fit.theta.size - study.model.e
         references = study.references or (None,) * study.robot.n
@@ -161,7 +164,10 @@ class PredictiveScore:
         return self.fit.study.volume
 
     def log_likelihoods_under(self, noise: Sequence[ArModel]) -> Array:
-        """Log-likelihood of the data of each joint under noise models, without constants of these data, (n,)."""
+        """Log-likelihood of the data of each joint under noise models, without constants of these data, (n,).
+
+        The noise of each stretch has a size of its own: models fit slow and fast motions differently well.
+        """
         each = self.volume[:, None] - 0.5 * np.log(self.innovations(noise))
         return np.asarray(np.sum(self.rows * each, axis=1))
 
@@ -186,7 +192,10 @@ class PredictiveScore:
         return np.array(found)
 
     def gain_over(self, other: "PredictiveScore", noise: Sequence[ArModel]) -> float:
-        """Gain of log-likelihood over a model without an effect, both under the same noise models."""
+        """Gain of log-likelihood over a model without an effect, both under the same noise models.
+
+        These should be of a model in which nothing is missing. Others would take what is missing for noise.
+        """
         ratio = np.log(other.innovations(noise) / self.innovations(noise))
         each = np.sum(self.rows * (0.5 * ratio + (self.volume - other.volume)[:, None]), axis=1)
         return float(np.sum(each / self.inflation_over(other, noise)))
@@ -254,7 +263,10 @@ def references_of(fit: IvFit) -> tuple[Array | None, ...]:
 
 
 def noise_of_motion(joint: JointEquations, rows: Array, theta: Array) -> Array:
-    """Torque (M, k) of k sets of rigid parameters at measured signals beyond that at simulated ones."""
+    """Torque (M, k) of k sets of rigid parameters at measured signals beyond that at simulated ones.
+
+    Simulated torques first follow the measured ones through a short filter, as simulated and real loop differ a little.
+    """
     if rows.shape[0] < LEAST_ROWS:
         return np.zeros((rows.shape[0], theta.shape[0]))
     x, z = (columns[columns < theta.shape[1]] for columns in (joint.x, joint.z))

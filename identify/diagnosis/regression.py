@@ -125,7 +125,10 @@ def fit_model(study: Study, theta0: Array | None = None, noise: Sequence[ArModel
 
 
 def safe(found: IvFit) -> IvFit:
-    """Return the fit, or one with noise models of lower order if its errors are much larger than with white weights."""
+    """Return the fit, or one with noise models of lower order if its errors are much larger than with white weights.
+
+    Strongly coloured noise emphasises frequencies where simulated and measured motion differ: weak instruments.
+    """
     white = found.renoised([ArModel(np.empty(0), ar.variance, 0.0) for ar in found.noise])
     most = found.study.criteria.weighted_errors * _rms(white)
     for order in (*LOWER_ORDERS, 0):

@@ -178,7 +178,10 @@ def _functions(old: ResidualStatistics, new: ResidualStatistics, part: slice, va
 def _whitened_functions(
     old: ResidualStatistics, new: ResidualStatistics, part: slice, variance: float
 ) -> tuple[Array, Array]:
-    """Whitened difference (r,) of the coefficients of some functions, and its change (r, k) per score of ``new``."""
+    """Whitened difference (r,) of the coefficients of some functions, and its change (r, k) per score of ``new``.
+
+    The noise of the baseline counts for both: a noise model of a changed arm would absorb a part of the change.
+    """
     information = [np.array(each.information)[part, part] for each in (old, new)]
     score = [np.array(each.score)[part] for each in (old, new)]
     scale = np.sqrt(np.maximum(np.diag(information[0]), 1e-300))

@@ -56,7 +56,10 @@ def score_statistic(fit: IvFit, columns: Sequence[tuple[int, Array]], sign: int 
 
 
 def contained(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> tuple[str, ...]:
-    """Linear parameters of a candidate whose torque the model can give without it, such as an inertia of two joints."""
+    """Linear parameters of a candidate whose torque the model can give without it, such as an inertia of two joints.
+
+    None if these are all: an effect keeps one parameter, which is then zero.
+    """
     columns = column_cache.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
     size = np.sqrt(np.sum([np.einsum("ij,ij->j", own, own) for _, own in columns], axis=0))
     size = np.where(size > 0.0, size, 1.0)

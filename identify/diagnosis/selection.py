@@ -221,7 +221,10 @@ class StepwiseSelection:
         return self.stopped
 
     def _aligned(self, state: ModelState) -> ModelState:
-        """Model with the common shift of the torques with which the base fit predicts clearly better."""
+        """Model with the common shift of the torques with which the base fit predicts clearly better.
+
+        The evidence of each joint is limited: an effect, or feedback of disturbances, may look like a shift.
+        """
         if not self.shifts:
             return state
         models = [fitted(state.study.with_torque_shift(shift), state.robot, state) for shift in self.shifts]
@@ -258,7 +261,10 @@ class StepwiseSelection:
         return self._states[key]
 
     def _study_of(self, robot: RobotConfig) -> Study:
-        """The study with the torques that a model corrects, and with the controller that these identify."""
+        """The study with the torques that a model corrects, and with the controller that these identify.
+
+        The controller of a late torque may make a loop that swings, whose motion shows nothing.
+        """
         recorded = tuple(entry for entry in robot.effects if of_recording(entry))
         if recorded == self.study.recorded:
             return self.study
@@ -299,7 +305,10 @@ class StepwiseSelection:
     def _exchanged(
         self, state: ModelState, found: tuple[Selected, ...], changed: NDArray[np.bool_] | None = None
     ) -> tuple[ModelState, tuple[Selected, ...]]:
-        """Model whose findings have competed with the other effects on joints ``changed`` (n,), and later findings."""
+        """Model whose findings have competed with the other effects on joints ``changed`` (n,), beside later findings.
+
+        A rival makes a finding superfluous. No return to an earlier model: each could prefer its own noise models.
+        """
         self._visited.add(_key(state.robot))
         for one in found:
             less = None if self._late() else self._without(state, one.entry)
@@ -322,7 +331,10 @@ class StepwiseSelection:
         return state, found
 
     def _confirmed(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
-        """Model with the findings that the report part confirms: those with a name, then by reduction of the errors."""
+        """Model with the findings that the report part confirms: those with a name, then by reduction of the errors.
+
+        Each model is estimated under the noise models of its own residual, as it is reported.
+        """
         self.progress("confirmation by the report part")
         while True:
             held = with_report_part(with_own_noise(state))

@@ -22,13 +22,20 @@ REFINEMENTS = 8
 def shapes_of_both_signals(
     fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes
 ) -> tuple[Shapes, ...]:
-    """Nonlinear parameters by measured signals and by simulated ones, where these differ; either may be wrong."""
+    """Nonlinear parameters by measured signals and by simulated ones, where these differ; either may be wrong.
+
+    Simulated signals are of a loop without the effect; measured ones contain noise that it amplifies.
+    """
     found = instrumented_shapes(fit, candidate, column_cache, shapes)
     return (shapes,) if found == shapes else (found, shapes)
 
 
 def instrumented_shapes(fit: IvFit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> Shapes:
-    """Continuous nonlinear parameters, one after the other, between their neighbours on the grid."""
+    """Continuous nonlinear parameters, one after the other, between their neighbours on the grid.
+
+    Effects of the motion alone keep theirs: that is simulated well; measured velocities are least accurate at
+    standstill.
+    """
     found = shapes
     if not candidate.effect.depends_on_torque:
         return found

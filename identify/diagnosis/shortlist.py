@@ -40,7 +40,10 @@ class Shortlist:
 
 
 def shortlist(state: ModelState, incumbent: Incumbent | None, alike: set[Key]) -> Shortlist:
-    """Return the candidates with the highest statistics less their parameters; with ``incumbent``, its rivals alone."""
+    """Return the candidates with the highest statistics less their parameters; with ``incumbent``, its rivals alone.
+
+    ``alike``: corrections that make no better loop, from one step to the next.
+    """
     criteria, column_cache = state.study.criteria, ColumnCache(state.study, state.fit.theta)
     noise = state.fit.renoised(state.weights)
     looks: list[tuple[float, Candidate, tuple[float, Shapes], Starts]] = []
@@ -95,7 +98,10 @@ def shortlist(state: ModelState, incumbent: Incumbent | None, alike: set[Key]) -
 
 
 def _loop_improves(state: ModelState, candidate: Candidate, value: float) -> bool:
-    """True if the controller that corrected torques identify follows the joint clearly better than the model's."""
+    """True if the controller that corrected torques identify follows the joint clearly better than that of the model.
+
+    Late torques, for example, give a controller whose loop swings: its motion shows no effect of the joint.
+    """
     entry = entry_of(candidate.effect, candidate.place, state.robot, {})
     parameters = {**entry.parameters, candidate.effect.linear[0].name: value}
     corrected = with_entries(state.robot, [entry.model_copy(update={"parameters": parameters})])

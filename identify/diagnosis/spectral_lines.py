@@ -102,7 +102,10 @@ def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, low
 
 
 def of_references(study: Study, frequency: float) -> bool:
-    """Return true if the references contain the line, too: set points have a rate of their own."""
+    """Return true if the references contain the line, too: set points have a rate of their own.
+
+    The motion modulates the line, so its width is a share of the bandwidth of the motion.
+    """
     wide, criteria = study.criteria.modulated_line * bandwidth_of_motion(study), study.criteria
     recorded = study.loop in CONTROLLERS
     every = (joint for reference in study.auxiliary.references for joint in reference.T)
@@ -112,7 +115,11 @@ def of_references(study: Study, frequency: float) -> bool:
 
 
 def has_line(reference: Array, sample: float, frequency: float, wide: float, least: float, *, recorded: bool) -> bool:
-    """Return true if a reference (N,) has a line within ``wide``, Hz, with ``least`` times the power around it."""
+    """Return true if a reference (N,) has a line within ``wide``, Hz, with ``least`` times the power around it.
+
+    Where none is recorded, the measured motion stands for it, which a vibration shakes, too: set points come once in a
+    whole number of samples.
+    """
     spectrum = _Spectrum.of(np.diff(reference, 2), sample)
     sharp = 2 * PADDING * spectrum.f[1]
     samples = 1.0 / (frequency * sample)

@@ -102,7 +102,10 @@ class Study:
         return tuple(entry for entry in self.robot.effects if of_recording(entry))
 
     def of_robot(self, robot: RobotConfig) -> "Study":
-        """The same recordings for another model, corrected again where its effect entries require other corrections."""
+        """The same recordings for another model, corrected again where its effect entries require other corrections.
+
+        Other wiring is another arm. Other torque corrections keep the simulated motion: instruments need not be exact.
+        """
         changed = replace(self, robot=robot, model=self.model.with_effects_of(robot, terms_of(robot)))
         if changed.recorded == self.recorded:
             return changed
@@ -191,7 +194,10 @@ class Study:
         return rigid + self.terms(stretch, kind, theta) @ theta[-self.model.e :] if self.model.e else rigid
 
     def resimulated(self, theta: Array) -> "Study":
-        """The study with the closed-loop motion of its model at ``theta`` (b,), unless that loop fails."""
+        """The study with the closed-loop motion of its model at ``theta`` (b,), except experiments held out altogether.
+
+        The same where that loop diverges or follows the arm less closely: it may be too stiff (`robot.relaxation`).
+        """
         motions = self._simulated(theta, sorted({s.experiment for s in self.train}))
         if motions is None:
             return self
@@ -203,7 +209,10 @@ class Study:
         return replace(self, train=train, held=self._moved(self.held, motions))
 
     def with_first_motions(self, theta: Array) -> "Study":
-        """The study whose simulations begin with the torques of terms at the motion of its own loop."""
+        """The study whose simulations begin with the torques of terms at the motion of its own loop.
+
+        Loops of models with one effect more or less then take one simulation instead of several.
+        """
         if self.auxiliary.first_motions is None or not self.model.e:
             return self
         numbers = sorted({s.experiment for s in self.train})
@@ -365,7 +374,10 @@ def _simulated(
 
 
 def _seen(q: Array, measured: Derivatives, dt: float) -> Derivatives:
-    """Simulated motion after the smoother of the measured one."""
+    """Simulated motion after the smoother of the measured one.
+
+    Set points arrive in steps, which the smoother removes: columns at either should differ by the noise alone.
+    """
     assert measured.nvr is not None
     return replace(differentiate(q, dt, nvr=measured.nvr[:, 0]), start=measured.start)
 

@@ -54,7 +54,11 @@ def with_transitions(state: ModelState, model: Fitter) -> ModelState:
 
 
 def _tied(state: ModelState, places: Sequence[Place], model: Fitter) -> list[Entry]:
-    """Transitions of joints whose best transition is too large: those beside a free curve of friction over speed."""
+    """Transitions of joints whose best transition is too large: those beside a free curve of friction over speed.
+
+    Friction that falls with the speed makes a transition too large, and is no part of it. Until an effect takes its
+    place, the transition has the size of the dry friction.
+    """
     curved = model(with_entries(state.robot, _curves(state, places)), state)
     if curved is None:
         return []
@@ -68,7 +72,11 @@ def _curves(state: ModelState, places: Sequence[Place]) -> list[Entry]:
 
 
 def _beside_curve(state: ModelState, entries: list[Entry], model: Fitter) -> list[Entry]:
-    """Those of the transitions that no free curve of friction over speed replaces."""
+    """Those of the transitions that no free curve of friction over speed replaces.
+
+    Few reversals do not determine a transition: it may take the place of friction that falls with the speed. Beside the
+    curve it is negative then, and the curve alone leaves less than half of the residual's power.
+    """
 
     def curves(some: list[Entry]) -> list[Entry]:
         return _curves(state, [Place(state.study.joints.index(str(entry.joint))) for entry in some])
@@ -165,7 +173,10 @@ class _Search:
         return made
 
     def _moved(self, place: Place, shapes: Shapes, factor: float, samples: float) -> Shapes:
-        """Return a transition beside another one, no less than the grid: a lead of zero would have no uncertainty."""
+        """Return a transition beside another one, no less than the grid: a lead of zero would have no uncertainty.
+
+        A motion may reach only a part of the joint's top speed: the largest velocity is the next one of the grid.
+        """
         given = dict(shapes)
         speeds, leads = (sorted({dict(one)[name] for one in self.grids[place]}) for name in ("velocity", "lead"))
         velocity = float(np.clip(given["velocity"] * np.exp(factor), speeds[0], speeds[-1] ** 2 / speeds[-2]))
@@ -174,7 +185,10 @@ class _Search:
 
 
 def _clear(state: ModelState, less: ModelState | None, entry: Entry, joint: int) -> bool:
-    """True if a transition is possible, and clearly improves the prediction of its joint's torque."""
+    """True if a transition is possible, and clearly improves the prediction of its joint's torque.
+
+    Each model predicts under noise models of its own, or both under those of the model without it.
+    """
     if less is None or not _possible(state, entry):
         return False
     own = (state.score.own_log_likelihoods - less.score.own_log_likelihoods)[joint]

@@ -64,7 +64,10 @@ def didim(
 def solve_didim(
     blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array
 ) -> tuple[Iterations, Sequence[ExperimentEquations]]:
-    """Iterations of DIDIM (2.36), and the equations of every experiment simulated at their last theta."""
+    """Iterations of DIDIM (2.36), and the equations of every experiment simulated at their last theta.
+
+    Raises DataError if no auxiliary model runs, not even the first.
+    """
     scale = noise = joint_variances(blocks, np.zeros_like(start))
 
     def step(previous: Array, _: int) -> tuple[Array, float]:

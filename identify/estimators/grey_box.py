@@ -41,7 +41,10 @@ class InverseController:
         return cls(inverse, tuple(fit_spectrum(1.0 / row**2, order) for row in gain))
 
     def __call__(self, blocks: Sequence[ExperimentEquations]) -> list[ExperimentEquations]:
-        """The same equations, torques (M, n) and regressor (M, n, b), at the motors and through ``C_j^-1``."""
+        """The same equations, torques (M, n) and regressor (M, n, b), at the motors and through ``C_j^-1``.
+
+        An equation of a motor is kept where those of all joints that load it are.
+        """
         return [
             ExperimentEquations(
                 self._filtered(block.y @ self.to_motor),
@@ -61,7 +64,10 @@ class InverseController:
 
 
 def controller_gain(controller: DiscreteController, factor: int) -> Array:
-    """Gain (n, K) of each motor's controller from position noise to torque, up to the decimated Nyquist frequency."""
+    """Gain (n, K) of each motor's controller from position noise to torque, up to the decimated Nyquist frequency.
+
+    Position noise enters with the tracking error and, in a velocity loop, with the position itself.
+    """
     z = np.exp(-1j * np.pi * np.linspace(0.0, 1.0, FREQUENCIES) / factor)
 
     def response(taps: Array) -> NDArray[np.complex128]:

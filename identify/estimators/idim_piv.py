@@ -139,7 +139,10 @@ def _solve(problem: Problem) -> Solved:
 
 
 def _difference_without_model_error(problem: Problem, estimate: Estimate, without: Estimate) -> Array:
-    """Difference (b,) of IDIM-PIV and IDIM-IV on data of exactly the model; zero where no loop can be simulated."""
+    """Difference (b,) of IDIM-PIV and IDIM-IV on data of exactly the model; zero where no loop can be simulated.
+
+    The prefilter weights high frequencies, at which the smoothed derivatives of few noisy samples are wrong.
+    """
     refined = problem.bias(estimate, prefiltered=True)
     plain = problem.plain_problem.bias(without, prefiltered=False)
     return np.zeros_like(without.theta) if refined is None or plain is None else refined - plain

@@ -36,7 +36,10 @@ class MotionInstruments(AuxiliaryModel):
         return cls(model, controller, motion, at_rest, dt, decimation, np.full(model.n, np.inf), feedback=False)
 
     def simulate(self, theta: Array, disturbances: Sequence[Array] | None = None) -> Sequence[Simulation] | None:
-        """The motion of every experiment, with the torques that base parameters (b,) need for it."""
+        """The motion of every experiment, with the torques that base parameters (b,) need for it.
+
+        ``disturbances`` have no effect: the motion is given.
+        """
         if not np.isfinite(theta).all():
             return None
 

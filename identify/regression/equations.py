@@ -126,7 +126,11 @@ def filtered_regressor(
 
 
 def thinned_regressor(model: ArmModel, signals: Derivatives, decimation: Decimation) -> Array:
-    """`filtered_regressor` at as few samples as a motion without noise needs: for instruments, not for equations."""
+    """`filtered_regressor` at as few samples as a motion without noise needs: for instruments, not for equations.
+
+    Dry friction has content beyond: it changes an instrument by percents where a joint turns round. Terms need all
+    samples.
+    """
     if model.terms or decimation.every == 1:
         return filtered_regressor(model, signals, decimation)
     q, qd, qdd = (decimation.thin(x) for x in (signals.q, signals.qd, signals.qdd))

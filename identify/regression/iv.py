@@ -231,7 +231,10 @@ def iv_products(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArModel
 
 
 def _combinations(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArModel]) -> tuple[Array | None, Array]:
-    """``T`` (b, b) that makes columns of ``Z T`` nearly orthonormal, and norms (b,), from every so many rows."""
+    """``T`` (b, b) that makes columns of ``Z T`` nearly orthonormal, and norms (b,), from every so many rows.
+
+    ``T`` is ``None`` where the columns are far enough from dependent.
+    """
     b = blocks[0].z.shape[2]
     total = sum(int(block.keep.sum()) for block in blocks)
     every = max(1, total // (SAMPLE * b))

@@ -159,7 +159,10 @@ class ArmModel:
         sharp_sign: bool = False,
         out: Floats | None = None,
     ) -> Floats:
-        """Regressor (N, n, p - e) of the standard parameters without the terms'; ``out``: zeros, or an earlier one."""
+        """Regressor (N, n, p - e) of the standard parameters without those of the terms.
+
+        ``out``: array to write into: zeros, or an earlier regressor of this model and length.
+        """
         return self._regressor(self.columns, len(self.names) - self.e, q, qd, qdd, sharp_sign, out)
 
     def base_regressor(
@@ -203,7 +206,10 @@ class ArmModel:
         return out
 
     def forward_dynamics(self, theta: ArrayLike, q: ArrayLike, qd: ArrayLike, tau: ArrayLike) -> Floats:
-        """Joint accelerations (N, n) of the direct dynamic model with smoothed friction (2.9), without the terms."""
+        """Joint accelerations (N, n) of the direct dynamic model with smoothed friction (2.9), without the terms.
+
+        Raises ArmidentError, with the sample, if a mass matrix is not positive definite.
+        """
         q, qd, tau = self._motion(q, qd, tau)
         out = np.empty_like(q)
         failed = fill_forward_dynamics(self.chain, self.values(theta), self.smoothing, q, qd, tau, out)

@@ -253,7 +253,10 @@ class Motion:
         return self._slopes[key]
 
     def _smooth(self, links: bool) -> tuple[Array, Array]:
-        """Predicted torques (N, n), and derivatives (n, N, n) by the accelerations of the joints on the first axis."""
+        """Predicted torques (N, n), and derivatives (n, N, n) by the accelerations of the joints on the first axis.
+
+        The sign of the friction is always smoothed: a jump has no derivative.
+        """
         if links not in self._still:
             theta = self.links if links else self._theta
             masses = self.model.mass_matrix(theta, self.q)

@@ -44,7 +44,10 @@ def by_rows(bench: Bench, h: Hypothesis) -> Hypothesis:
 
 
 def by_friction(bench: Bench, h: Hypothesis) -> Array:
-    """Return the signed permutation (n, n) from recorded torques to the recorded positions that they belong to."""
+    """Return the signed permutation (n, n) from recorded torques to the recorded positions that they belong to.
+
+    Dry friction changes only the torque of its own joint where that joint turns round. Needs no model of the arm.
+    """
     n = bench.n
     rows = bench.rows(np.eye(n))
     dry, slow = rows.friction[:, :, 0], rows.qd

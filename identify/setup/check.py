@@ -53,7 +53,10 @@ TRIED = {
 
 
 def check_setup(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
-    """Compare the set-up as configured with its possible mistakes, each with everything refitted."""
+    """Compare the set-up as configured with its possible mistakes, each with everything refitted.
+
+    Recordings: SI, joint side, one rate. Mistakes that ``effects`` of the configuration correct are corrected first.
+    """
     _validate(experiments, robot)
     # The matrices are small: threads delay each other.
     with threadpool_limits(1):
@@ -149,7 +152,10 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
 
 
 def _whole(experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]) -> list[int]:
-    """Return the numbers of the experiments that move all joints that move in any; all if there are none."""
+    """Return the numbers of the experiments that move all joints that move in any; all if there are none.
+
+    A joint at rest says nothing of its order, scale or clock, and its friction would pass for a mistake of them.
+    """
     whole = [k for k, e in enumerate(experiments) if signals.moving_joints([e], robot)[moving].all()]
     return whole or list(range(len(experiments)))
 
@@ -185,7 +191,10 @@ def _unless_zero_explains(search: Search, best: Step) -> Step:
 
 
 def _stretch(bench: Bench, best: Step) -> tuple[Step, ChangedStretch | None]:
-    """Return the set-up, and the stretch of time in which the arm is another one."""
+    """Return the set-up, and the stretch of time in which the arm is another one.
+
+    A change in time competes with the corrections: they go where it explains the torques as well without them.
+    """
     found = stretch(bench, best.h)
     if best.mistakes and best.h.clock == 1.0:
         configured = Step(as_configured(bench.robot))
@@ -211,7 +220,10 @@ def _searched(
 
 
 def _with_exact_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> Step:
-    """Replace a common shift that the search has found, if it can be estimated to a factor of 2."""
+    """Replace a common shift that the search has found, if it can be estimated to a factor of 2.
+
+    Prediction gives too short a shift where the closed loop follows disturbances, and where a joint stops suddenly.
+    """
     common = float(np.median(best.h.shift[bench.moving]))
     found = long_torque_shift(experiments, bench, best.h, common, abs(common))
     if found is None or found.std > abs(found.samples) / 2.0:
@@ -220,7 +232,10 @@ def _with_exact_shift(experiments: Sequence[Experiment], bench: Bench, best: Ste
 
 
 def _with_instrumented_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> Step:
-    """Add a common shift that the recorded references show and the search has not found, if two joints confirm it."""
+    """Add a common shift that the recorded references show and the search has not found, if two joints confirm it.
+
+    Disturbances in the closed loop may hide it from prediction, not from the instruments.
+    """
     found = long_torque_shift(experiments, bench, best.h, 0.0, LONGEST_SHIFT_S)
     if found is None or not found.confirmed:
         return best

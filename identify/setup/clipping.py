@@ -73,7 +73,10 @@ class Clip:
 
 
 def clipped_torques(bench: Bench, h: Hypothesis) -> list[Clip]:
-    """Return the torques whose largest values lie where the model, fitted to the other rows, needs clearly more."""
+    """Return the torques whose largest values lie where the model, fitted to the other rows, needs clearly more.
+
+    Dry friction is also nearly constant over long times, but there the model needs no more than recorded.
+    """
     x, y, physical = equations(bench.everywhere, h)
     found = []
     for k in np.flatnonzero(bench.moving):

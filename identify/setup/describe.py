@@ -117,7 +117,10 @@ def _groups(step: Step) -> Iterator[tuple[int, int]]:
 
 
 def _of_a_drive(step: Step, k: int, bench: Bench) -> bool:
-    """True for torque constants that differ moderately: effects of the drives (`drive_gain_error`)."""
+    """True for torque constants that differ moderately: effects of the drives (`drive_gain_error`).
+
+    Of a unit of every drive, those count that the motion determines.
+    """
     logs = np.log(np.abs(np.diag(step.mistakes[k].torque)))
     if step.families[k] == "torque_scale":
         return bool(np.all(np.abs(logs) < np.log(LEAST_TORQUE)))

@@ -40,7 +40,10 @@ SHIFTS_S = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
 
 
 def best_direction(h: Hypothesis, criterion: SlopedCriterion) -> Hypothesis:
-    """Return the hypothesis with the best direction of gravity, of the same magnitude."""
+    """Return the hypothesis with the best direction of gravity, of the same magnitude.
+
+    Opposite directions fit equally where first moments change sign, too: the one nearest to the configured one wins.
+    """
     size = float(np.linalg.norm(h.gravity)) or STANDARD
     tried = sorted(DIRECTIONS, key=lambda d: criterion(replace(h, gravity=size * d)).value)
     starts = [*tried[:STARTS], *([h.gravity / size] if h.gravity.any() else [])]

@@ -57,7 +57,10 @@ def signs_of(robot: RobotConfig, joints: Sequence[int], where: str = "") -> Iter
 
 
 def set_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
-    """The same mistake of sign, unit or side at every set of two and more joints."""
+    """The same mistake of sign, unit or side at every set of two and more joints.
+
+    Joints are coupled: one of such mistakes, corrected alone, may improve nothing.
+    """
     for size in range(2, len(joints) + 1):
         for chosen in combinations(joints, size):
             yield from signs_of(robot, chosen)

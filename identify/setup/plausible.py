@@ -69,7 +69,10 @@ def log_plausibility(bench: Bench, h: Hypothesis) -> float:
 
 
 def worst_change(bench: Bench, old: Hypothesis, new: Hypothesis) -> float:
-    """Smallest change over the moving joints of the log plausibility of their own signals."""
+    """Smallest change over the moving joints of the log plausibility of their own signals; negative if one gets worse.
+
+    A wrong unit of one joint hardly changes the mean over all joints.
+    """
 
     def each(h: Hypothesis) -> Array:
         logs, usable = _logs(bench, h)

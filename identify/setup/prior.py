@@ -68,7 +68,10 @@ def composed(start: Hypothesis, mistakes: Iterable[Mistake]) -> Hypothesis:
 
 
 def cost(mistakes: Iterable[Mistake], n: int) -> float:
-    """Negative logarithm of the prior of a hypothesis, nats."""
+    """Negative logarithm of the prior of a hypothesis, nats.
+
+    Permutations and signs are judged by their product: two ways to the same wiring cost the same.
+    """
     total, position, torque = 0.0, np.eye(n), np.eye(n)
     for m in mistakes:
         if m.family in WIRING and not m.raw:

@@ -77,7 +77,10 @@ class TorqueShift:
 
     @property
     def correction(self) -> float:
-        """Shift that is corrected, samples; 0 for none, and if the estimate is too uncertain."""
+        """Shift that is corrected, samples; 0 for none, and if the estimate is too uncertain.
+
+        That of an agreeing sampling convention, which is more exact; else the estimate up to one sample.
+        """
         if not self.determined:
             return 0.0
         if any(abs(self.samples - shift) <= SIGNIFICANT * self.std for shift in CONVENTIONS):

@@ -223,7 +223,10 @@ class Search:
         return best
 
     def _material(self, old: Hypothesis, new: Hypothesis, least: float) -> bool:
-        """True if a correction makes no joint implausible, and more joints improve by a factor than get worse."""
+        """True if a correction makes no joint implausible, and more joints improve by a factor than get worse.
+
+        With and without the free terms: helping these alone only fits an effect that the model lacks.
+        """
         if worst_change(self.bench, old, new) < -LEAST_ODDS:
             return False
         return all(self._improved(old, new, free=free) >= np.log(least) for free in (True, False))
@@ -408,7 +411,10 @@ def angle_between(a: Array, b: Array) -> float:
 
 
 def independent_rows(residual: Array) -> Array:
-    """Number (n,), at least 4, of independent rows of serially correlated residuals (M, n) (Bartlett 1946)."""
+    """Number (n,) of independent rows with the serial correlation of residuals (M, n), at least 4.
+
+    ``M (1 - r) / (1 + r)`` for the correlation r of neighbouring rows (Bartlett 1946).
+    """
     power = np.maximum((residual**2).sum(axis=0), 1e-300)
     r = np.clip((residual[1:] * residual[:-1]).sum(axis=0) / power, 0.0, 0.99)
     rows: Array = np.maximum(residual.shape[0] * (1 - r) / (1 + r), 4.0)

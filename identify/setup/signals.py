@@ -100,7 +100,10 @@ def small_torque_findings(experiments: Sequence[Experiment], robot: RobotConfig)
 def absolute_findings(
     experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]
 ) -> list[SetupFinding]:
-    """Return a finding if the torques of all moving joints are never negative: their sign is lost."""
+    """Return a finding if the torques of all moving joints are never negative: their sign is lost, or coded otherwise.
+
+    Gravity may keep one joint above zero, but not all of an arm.
+    """
     lowest = np.min([e.tau.min(axis=0) for e in experiments], axis=0)[moving]
     highest = np.max([e.tau.max(axis=0) for e in experiments], axis=0)[moving]
     reached = np.any(lowest <= REACHES_ZERO * highest) and np.all(highest > 0.0)

@@ -74,7 +74,10 @@ class _Columns:
 def long_torque_shift(
     experiments: Sequence[Experiment], bench: Bench, h: Hypothesis, first_s: float, reach_s: float
 ) -> TorqueShift | None:
-    """Estimate a common shift of many samples; ``None`` where none is determined within ``reach_s`` of ``first_s``."""
+    """Estimate a common shift of many samples; ``None`` where none is determined within ``reach_s`` of ``first_s``.
+
+    The estimate is linear: it is repeated with torques moved by the last value until that changes no more.
+    """
     first, reach = first_s / bench.period, reach_s / bench.period
     shift = first
     for _ in range(ROUNDS):
@@ -95,7 +98,10 @@ def long_torque_shift(
 
 
 def common_shift(experiments: Sequence[Experiment], bench: Bench, h: Hypothesis) -> TorqueShift:
-    """Estimate the common shift of the torques, up to `RANGE` samples, and that of every joint."""
+    """Estimate the common shift of the torques, up to `RANGE` samples, and that of every joint.
+
+    Raises DataError or numpy.linalg.LinAlgError if the motion determines no shift.
+    """
     return _common(_estimated(experiments, bench, h, 0.0), RANGE)
 
 

@@ -86,7 +86,10 @@ class ZeroOffset:
 
 
 def zero_offset(bench: Bench, h: Hypothesis) -> ZeroOffset | None:
-    """Return the offset of one revolute joint that explains the recordings, ``None`` without one."""
+    """Return the offset of one revolute joint that explains the recordings, ``None`` without one.
+
+    It gains the odds and the drop of any mistake over the set-up ``h``, with its prior, on held-out data.
+    """
     revolute = np.array([joint.type == "revolute" for joint in bench.robot.joints])
     steps, gains, _ = _steps(bench, h)
     price = MISTAKE + float(np.log(bench.n))
@@ -124,7 +127,10 @@ def _exact(bench: Bench, h: Hypothesis, j: int, step: float) -> tuple[float, flo
 
 
 def _steps(bench: Bench, h: Hypothesis) -> tuple[Array, Array, Array]:
-    """Gauss-Newton step of each joint's offset alone, rad, its gain of the score, nats, and deviation, (n,) each."""
+    """Gauss-Newton step of each joint's offset alone, rad, its gain of the score, nats, and its deviation, (n,) each.
+
+    All parameters are free beside it; every joint counts by the power of its own residual.
+    """
     found, x = fit(bench, h), regressors(bench, h)
     residual = found.residual @ h.torque.T
     weights = np.where(bench.moving, 1.0 / np.maximum((residual**2).mean(axis=0), 1e-300), 0.0)
