@@ -52,23 +52,32 @@ class GivenMotion:
 
 @dataclass(frozen=True, eq=False)
 class ProgramRun:
-    """Torques (N, n) that a program computes at every ``every``-th instant, N m or N; ``remark``: further findings."""
+    """Torques (N, n) that a program computes at every ``every``-th instant, N m or N; ``remark``: further findings.
+
+    ``dry``: its own dry friction in them.
+    """
 
     program: str
     torque: Floats
     remark: str = ""
     every: int = 1
+    dry: Floats | float = 0.0
 
 
 def run_python(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
     """Call the Python module."""
-    module = _module(files[0])
-    memory, torque = [0.0] * len(code_of(model, "python").content["memory"]), []
+    return ProgramRun(f"Python {versions()['python']}", module_torque(model, files[0], motion, "inverse_dynamics"))
+
+
+def module_torque(model: ExportedModel, file: Path, motion: GivenMotion, function: str = "rest") -> Floats:
+    """Return the torques (N, n) by a function of a Python module."""
+    module, torque = _module(file), []
+    memory = [0.0] * len(code_of(model, "python").content["memory"])
     for row in motion.rows:
         q, qd, qdd = (x.tolist() for x in row)
         memory = module.advance(memory, qd, motion.dt) if memory else memory
-        torque.append(module.inverse_dynamics(q, qd, qdd, *([memory] if memory else ())))
-    return ProgramRun(f"Python {versions()['python']}", np.array(torque))
+        torque.append(getattr(module, function)(q, qd, qdd, *([memory] if memory else ())))
+    return np.array(torque)
 
 
 def run_c(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
@@ -185,8 +194,8 @@ def _pinocchio(pin: Any, arm: Any, motion: GivenMotion) -> ProgramRun:
     """Return the torques by the recursive algorithm, with friction and damping of the file as simulators add them."""
     data, neutral = arm.createData(), pin.neutral(arm)
     rows = [pin.rnea(arm, data, pin.integrate(arm, neutral, q), qd, qdd) for q, qd, qdd in motion.rows]
-    friction = arm.damping * motion.qd + arm.friction * np.sign(motion.qd)
-    return ProgramRun(f"Pinocchio {pin.__version__}", np.array(rows) + friction)
+    dry = arm.friction * np.sign(motion.qd)
+    return ProgramRun(f"Pinocchio {pin.__version__}", np.array(rows) + arm.damping * motion.qd + dry, dry=dry)
 
 
 def run_sdf(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
