@@ -54,7 +54,7 @@ class Code:
 def write_python(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
     """Write a Python module that needs only ``math``; see `armident.identify.model_export.formats.Format.write`."""
     code = code_of(model, "python")
-    write_atomically(path, code.render("model.py.jinja", feed_forward=False, rest=None))
+    write_atomically(path, code.render("model.py.jinja", feed_forward=False, supplement=None))
     return [path], code.sheet
 
 
@@ -62,7 +62,7 @@ def write_lerobot(model: ExportedModel, path: Path) -> tuple[list[Path], Limitat
     """Write the Python module with feed-forward torques for actions of LeRobot, which reads no dynamic model itself."""
     code = code_of(model, "lerobot")
     remark = "LeRobot has no file for such terms: a loop that commands torques imports the module"
-    write_atomically(path, code.render("model.py.jinja", feed_forward=True, rest=None))
+    write_atomically(path, code.render("model.py.jinja", feed_forward=True, supplement=None))
     return [path], replace(code.sheet, remarks=(*code.sheet.remarks, remark))
 
 
@@ -75,7 +75,7 @@ def write_c(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationShe
     return [path, header], code.sheet
 
 
-def write_rest(model: ExportedModel, file: Path, sheet: LimitationSheet, path: Path) -> LimitationSheet | None:
+def write_supplement(model: ExportedModel, file: Path, sheet: LimitationSheet, path: Path) -> LimitationSheet | None:
     """Write a Python module of the torques that ``file`` lacks; return its sheet with a remark, or ``None`` if none.
 
     Dry friction counts as lacking where the file has any part less than the rigid model: programs give it a sharp sign.
@@ -86,7 +86,7 @@ def write_rest(model: ExportedModel, file: Path, sheet: LimitationSheet, path: P
         return None
     frames, name = with_rigid_effects(model)[0].frames, _safe(file.name)
     rotors = [joint.rotor_inertia if "rotor inertia" in sheet.holds else 0.0 for joint in model.joints]
-    rest = {
+    supplement = {
         "file": name,
         "held": [] if rigid else [(rotor, joint.viscous) for rotor, joint in zip(rotors, model.joints, strict=True)],
         "gravity": (frames.frame_0.T @ frames.gravity).tolist(),
@@ -94,7 +94,9 @@ def write_rest(model: ExportedModel, file: Path, sheet: LimitationSheet, path: P
     }
     title = f"Joint torques of the robot {model.robot.name} that {name} lacks."
     head = {"title": title, "lines": code.content["head"]["lines"]}
-    write_atomically(path, code.render("model.py.jinja", feed_forward=False, rest=rest, effects=effects, head=head))
+    write_atomically(
+        path, code.render("model.py.jinja", feed_forward=False, supplement=supplement, effects=effects, head=head)
+    )
     lost = [omission.part for omission in sheet.omitted if omission in code.sheet.omitted]
     instead = "" if rigid else ", with dry friction instead of that of the program"
     remark = f"{path.name} computes the torques that the file lacks{instead}{'; not: ' * bool(lost)}{'; '.join(lost)}"

@@ -69,7 +69,7 @@ def run_python(model: ExportedModel, files: Sequence[Path], motion: GivenMotion)
     return ProgramRun(f"Python {versions()['python']}", module_torque(model, files[0], motion, "inverse_dynamics"))
 
 
-def module_torque(model: ExportedModel, file: Path, motion: GivenMotion, function: str = "rest") -> Floats:
+def module_torque(model: ExportedModel, file: Path, motion: GivenMotion, function: str = "supplement") -> Floats:
     """Return the torques (N, n) by a function of a Python module."""
     module, torque = _module(file), []
     memory = [0.0] * len(code_of(model, "python").content["memory"])

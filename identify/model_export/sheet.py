@@ -33,8 +33,8 @@ class Omission:
 class Measured:
     """Figures of a file: program, motion, torque difference in total and by joint (percent), and remarks.
 
-    ``missing``: reason for which there are no figures; empty if there are. ``rest``: module that completes the torques,
-    and ``error_pct_with_rest`` their difference.
+    ``missing``: reason for which there are no figures; empty if there are. ``supplement``: module whose torques leave
+    ``error_pct_with_supplement``.
     """
 
     program: str = ""
@@ -43,8 +43,8 @@ class Measured:
     error_pct_by_joint: dict[str, float] | None = None
     remarks: Sequence[str] = ()
     missing: str = ""
-    rest: str = ""
-    error_pct_with_rest: float | None = None
+    supplement: str = ""
+    error_pct_with_supplement: float | None = None
 
     def lines(self) -> list[str]:
         """Return the figures as sentences."""
@@ -55,8 +55,8 @@ class Measured:
             f"{self.program} computes torques that differ by {self.error_pct:.2g} % from those of the identified model "
             f"({each}) along {self.motion}"
         )
-        if self.error_pct_with_rest is not None:
-            found += f", and by {self.error_pct_with_rest:.2g} % with the torques of {self.rest}"
+        if self.error_pct_with_supplement is not None:
+            found += f", and by {self.error_pct_with_supplement:.2g} % with the torques of {self.supplement}"
         return [found, *self.remarks]
 
     def document(self) -> dict[str, Any]:

@@ -62,9 +62,9 @@ def measure(model: ExportedModel, format_name: str, files: Sequence[Path], motio
         return Measured(missing=str(error))
     expected = identified_torque(model, motion)[:: run.every]
     settled = min(round(SETTLED_S / motion.dt / run.every), len(expected) // 5)
-    rest = next((file for file in files if file.name.endswith("_rest.py")), None)
-    completed = run.torque if rest is None else run.torque - run.dry + consumers.module_torque(model, rest, motion)
-    compared, title = [expected, run.torque - expected, completed - expected], motion.title
+    supplement = next((file for file in files if file.name.endswith("_supplement.py")), None)
+    added = 0.0 if supplement is None else consumers.module_torque(model, supplement, motion) - run.dry
+    compared, title = [expected, run.torque - expected, run.torque + added - expected], motion.title
     period = motion.dt * run.every
     if any(effect.effect == "backlash" for effect in model.effects) and period < 0.5 / IMPACT_BAND_HZ:
         compared = [butterworth(torque, period, IMPACT_BAND_HZ) for torque in compared]
@@ -81,8 +81,8 @@ def measure(model: ExportedModel, format_name: str, files: Sequence[Path], motio
         float(100.0 * np.linalg.norm(errors) / size),
         {joint.name: float(value) for joint, value in zip(model.joints, by_joint, strict=True)},
         [remark for remark in remarks if remark],
-        rest="" if rest is None else rest.name,
-        error_pct_with_rest=None if rest is None else float(100.0 * np.linalg.norm(remaining) / size),
+        supplement="" if supplement is None else supplement.name,
+        error_pct_with_supplement=None if supplement is None else float(100.0 * np.linalg.norm(remaining) / size),
     )
 
 

@@ -106,8 +106,8 @@ def cell(model: ExportedModel, format_name: str, folder: Path) -> str:
     if found.error_pct is None:
         return found.missing
     kept = all(any(effect.title in part for part in sheet.held) for effect in model.effects)
-    if found.error_pct_with_rest is not None:
-        return f"{_percent(found.error_pct)}; {_percent(found.error_pct_with_rest)}"
+    if found.error_pct_with_supplement is not None:
+        return f"{_percent(found.error_pct)}; {_percent(found.error_pct_with_supplement)}"
     return f"{_percent(found.error_pct)}{'' if kept else ', left out'}"
 
 

@@ -38,8 +38,8 @@ def figures(sheet: LimitationSheet) -> tuple[float, float]:
     """Torque differences without and with the module, percent."""
     assert sheet.measured is not None
     assert sheet.measured.error_pct is not None, sheet.measured.missing
-    assert sheet.measured.error_pct_with_rest is not None
-    return sheet.measured.error_pct, sheet.measured.error_pct_with_rest
+    assert sheet.measured.error_pct_with_supplement is not None
+    return sheet.measured.error_pct, sheet.measured.error_pct_with_supplement
 
 
 def of_python(model: ExportedModel, folder: Path) -> float:
@@ -75,10 +75,10 @@ def tx40() -> ExportedModel:
 def test_a_file_and_its_module_are_as_exact_as_the_whole_python_module(
     format_name: str, tx40: ExportedModel, tmp_path: Path
 ) -> None:
-    alone, with_rest = figures(sheet_of(tx40, format_name, tmp_path))
+    alone, with_supplement = figures(sheet_of(tx40, format_name, tmp_path))
     assert alone > 1.0
-    assert with_rest == pytest.approx(of_python(tx40, tmp_path), abs=ROUNDING_PCT)
-    assert with_rest < 0.01
+    assert with_supplement == pytest.approx(of_python(tx40, tmp_path), abs=ROUNDING_PCT)
+    assert with_supplement < 0.01
 
 
 @pytest.mark.parametrize("right_angles", [True, False])
@@ -114,49 +114,49 @@ def test_drake_needs_the_same_module_beside_a_urdf_as_pinocchio(tmp_path: Path) 
     from pydrake.multibody.tree import MultibodyForces
 
     model = tx40_with(Effect(effect="joint_spring", joint="joint_2"), values=(20.0,))
-    file, rest, _ = export_model(model, "urdf", tmp_path)[0]
+    file, supplement, _ = export_model(model, "urdf", tmp_path)[0]
     plant = MultibodyPlant(time_step=0.0)
     Parser(plant).AddModels(str(file))
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(model.frames.base))
     plant.mutable_gravity_field().set_gravity_vector(model.frames.gravity)
     plant.Finalize()
-    context, module = plant.CreateDefaultContext(), module_of(rest)
+    context, module = plant.CreateDefaultContext(), module_of(supplement)
     motion, rows = random_motion(model.robot, np.random.default_rng(7)), []
     for q, qd, qdd in zip(*motion, strict=True):
         plant.SetPositions(context, q)
         plant.SetVelocities(context, qd)
         forces = MultibodyForces(plant)
         plant.CalcForceElementsContribution(context, forces)
-        rows.append(plant.CalcInverseDynamics(context, qdd, forces) + module.rest(q, qd, qdd))
+        rows.append(plant.CalcInverseDynamics(context, qdd, forces) + module.supplement(q, qd, qdd))
     assert relative_error(np.array(rows), model.model.inverse_dynamics(*motion, dt=1e-3)) < 1e-9
 
 
 def test_mujoco_gets_the_effects_alone_that_it_lacks(tmp_path: Path) -> None:
     model = model_with("load_dependent_friction")
     files, sheet = export_model(model, "mjcf", tmp_path, motion_of(model))
-    assert [file.name for file in files] == ["tx40.xml", "tx40_mjcf_rest.py", "tx40_mjcf_limits.md"]
-    alone, with_rest = figures(sheet)
-    assert with_rest < 1.0 < alone
+    assert [file.name for file in files] == ["tx40.xml", "tx40_mjcf_supplement.py", "tx40_mjcf_limits.md"]
+    alone, with_supplement = figures(sheet)
+    assert with_supplement < 1.0 < alone
     q, qd, _ = np.random.default_rng(1).uniform(-1.0, 1.0, (3, 6)).tolist()
     # Friction that the file has is not counted twice: joints without the effect have no torque.
-    found = module_of(files[1]).rest(q, qd, [0.0] * 6)
+    found = module_of(files[1]).supplement(q, qd, [0.0] * 6)
     assert [k for k, torque in enumerate(found) if torque] == [1]
 
 
 def test_a_file_that_lacks_nothing_has_no_module(tmp_path: Path) -> None:
     files, sheet = export_model(model_with(""), "mjcf", tmp_path)
     assert [file.name for file in files] == ["tx40.xml", "tx40_mjcf_limits.md"]
-    assert not any("rest" in remark for remark in sheet.remarks)
+    assert not any("supplement" in remark for remark in sheet.remarks)
 
 
 def test_the_page_names_the_module_its_figure_and_its_gaps(tmp_path: Path) -> None:
     model = tx40_with(Effect(effect="backlash", joint="joint_2", parameters={"gap": 1e-3, "rotor": 0.0}), values=(1.0,))
     sheet = sheet_of(model, "urdf", tmp_path)
     page = (tmp_path / "tx40_urdf_limits.md").read_text()
-    assert re.search(r"and by [0-9.]+ % with the torques of tx40_urdf_rest\.py", page)
-    assert "tx40_urdf_rest.py computes the torques that the file lacks" in page
+    assert re.search(r"and by [0-9.]+ % with the torques of tx40_urdf_supplement\.py", page)
+    assert "tx40_urdf_supplement.py computes the torques that the file lacks" in page
     assert "not: backlash of the gear (backlash) of joint_2" in page
-    assert sheet.document()["measured"]["rest"] == "tx40_urdf_rest.py"
+    assert sheet.document()["measured"]["supplement"] == "tx40_urdf_supplement.py"
     assert figures(sheet)[1] < figures(sheet)[0]
 
 
