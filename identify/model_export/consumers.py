@@ -199,22 +199,35 @@ def _pinocchio(pin: Any, arm: Any, motion: GivenMotion) -> ProgramRun:
 
 
 def run_sdf(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
-    """Let Drake compute the torques, gravity set."""
+    """Let Drake compute the torques, gravity set; what turns behind a gear moves freely."""
     parsing, plants, tree = (_package(f"pydrake.multibody.{part}", "drake") for part in ("parsing", "plant", "tree"))
+    analysis = _package("pydrake.systems.analysis", "drake")
     plant = plants.MultibodyPlant(time_step=0.0)
     parsing.Parser(plant).AddModels(str(files[0]))
     plant.mutable_gravity_field().set_gravity_vector(model.frames.gravity)
     plant.Finalize()
-    context, rows = plant.CreateDefaultContext(), []
+    context, free, rows = plant.CreateDefaultContext(), plant.CreateDefaultContext(), []
     order = [plant.GetJointByName(joint_name(model, k)).velocity_start() for k in range(model.arm.n)]
+    q, qd, qdd, force = np.zeros((4, plant.num_velocities()))
+    behind = np.delete(np.arange(q.size), order)
+    for k in plant.GetJointActuatorIndices():
+        plant.get_joint_actuator(k).SetRotorInertia(free, PRESCRIBED)
+    simulator = analysis.Simulator(plant, free)
     for row in motion.rows:
-        q, qd, qdd = np.zeros((3, len(order)))
         q[order], qd[order], qdd[order] = row
+        if behind.size:
+            force[order] = PRESCRIBED * row[2]
+            plant.get_applied_generalized_force_input_port().FixValue(free, force)
+            plant.SetPositionsAndVelocities(free, np.concatenate([q, qd]))
+            qdd[behind] = plant.EvalTimeDerivatives(free).CopyToVector()[q.size :][behind]
         plant.SetPositions(context, q)
         plant.SetVelocities(context, qd)
         forces = tree.MultibodyForces(plant)
         plant.CalcForceElementsContribution(context, forces)
         rows.append(plant.CalcInverseDynamics(context, qdd, forces)[order])
+        if behind.size:
+            simulator.AdvanceTo(free.get_time() + motion.dt)
+            q[behind], qd[behind] = plant.GetPositions(free)[behind], plant.GetVelocities(free)[behind]
     return ProgramRun(f"Drake {version('drake')}", np.array(rows))
 
 

@@ -131,6 +131,15 @@ def test_drake_needs_the_same_module_beside_a_urdf_as_pinocchio(tmp_path: Path) 
     assert relative_error(np.array(rows), model.model.inverse_dynamics(*motion, dt=1e-3)) < 1e-9
 
 
+@pytest.mark.slow
+def test_drake_has_an_elastic_joint_as_two_joints(tmp_path: Path) -> None:
+    model = model_with("joint_elasticity")
+    sheet = sheet_of(model, "sdf", tmp_path)
+    assert any("an elastic joint" in part for part in sheet.held)
+    # Without the second joint, the torques of the Python module lack the effect.
+    assert figures(sheet)[1] < 0.5 * of_python(model, tmp_path)
+
+
 def test_mujoco_gets_the_effects_alone_that_it_lacks(tmp_path: Path) -> None:
     model = model_with("load_dependent_friction")
     files, sheet = export_model(model, "mjcf", tmp_path, motion_of(model))
