@@ -97,7 +97,8 @@ def write_supplement(model: ExportedModel, file: Path, sheet: LimitationSheet, p
     write_atomically(
         path, code.render("model.py.jinja", feed_forward=False, supplement=supplement, effects=effects, head=head)
     )
-    lost = [omission.part for omission in sheet.omitted if omission in code.sheet.omitted]
+    # Omissions with a reason are corrections of recordings, which are no torques of the arm.
+    lost = [each.part for each in sheet.omitted if each in code.sheet.omitted and not each.reason]
     instead = "" if rigid else ", with dry friction instead of that of the program"
     remark = f"{path.name} computes the torques that the file lacks{instead}{'; not: ' * bool(lost)}{'; '.join(lost)}"
     return replace(sheet, remarks=(*sheet.remarks, remark))
