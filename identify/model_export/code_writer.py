@@ -18,6 +18,7 @@ from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.effects.registry import of_entry
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.formulas import FUNCTIONS, InstantModel, instant_model
+from armident.identify.model_export.rigid_effects import with_rigid_effects
 from armident.identify.model_export.sheet import PARTS, LimitationSheet, limitation_sheet
 
 EVERY_PART = (*PARTS, "couplings", "gravity")
@@ -46,14 +47,14 @@ class Code:
     sheet: LimitationSheet
 
     def render(self, template: str, **more: Any) -> str:
-        """Return the text of a file. ``template``: name in ``templates``; ``**more``: further variables."""
-        return _TEMPLATES.get_template(template).render(**self.content, **more)
+        """Return the text of a file. ``template``: name in ``templates``; ``**more``: further or other variables."""
+        return _TEMPLATES.get_template(template).render({**self.content, **more})
 
 
 def write_python(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationSheet]:
     """Write a Python module that needs only ``math``; see `armident.identify.model_export.formats.Format.write`."""
     code = code_of(model, "python")
-    write_atomically(path, code.render("model.py.jinja", feed_forward=False))
+    write_atomically(path, code.render("model.py.jinja", feed_forward=False, supplement=None))
     return [path], code.sheet
 
 
@@ -61,7 +62,7 @@ def write_lerobot(model: ExportedModel, path: Path) -> tuple[list[Path], Limitat
     """Write the Python module with feed-forward torques for actions of LeRobot, which reads no dynamic model itself."""
     code = code_of(model, "lerobot")
     remark = "LeRobot has no file for such terms: a loop that commands torques imports the module"
-    write_atomically(path, code.render("model.py.jinja", feed_forward=True))
+    write_atomically(path, code.render("model.py.jinja", feed_forward=True, supplement=None))
     return [path], replace(code.sheet, remarks=(*code.sheet.remarks, remark))
 
 
@@ -72,6 +73,35 @@ def write_c(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationShe
     write_atomically(header, code.render("model.h.jinja"))
     write_atomically(path, code.render("model.c.jinja"))
     return [path, header], code.sheet
+
+
+def write_supplement(model: ExportedModel, file: Path, sheet: LimitationSheet, path: Path) -> LimitationSheet | None:
+    """Write a Python module of the torques that ``file`` lacks; return its sheet with a remark, or ``None`` if none.
+
+    Dry friction counts as lacking where the file has any part less than the rigid model: programs give it a sharp sign.
+    """
+    code, rigid = code_of(model, "python"), sheet.holds.issuperset(EVERY_PART)
+    effects = [effect for effect in code.content["effects"] if effect["number"] not in sheet.effects]
+    if rigid and not effects:
+        return None
+    frames, name = with_rigid_effects(model)[0].frames, _safe(file.name)
+    rotors = [joint.rotor_inertia if "rotor inertia" in sheet.holds else 0.0 for joint in model.joints]
+    supplement = {
+        "file": name,
+        "held": [] if rigid else [(rotor, joint.viscous) for rotor, joint in zip(rotors, model.joints, strict=True)],
+        "gravity": (frames.frame_0.T @ frames.gravity).tolist(),
+        "links": model.arm.values(model.theta).inertial.tolist(),
+    }
+    title = f"Joint torques of the robot {model.robot.name} that {name} lacks."
+    head = {"title": title, "lines": code.content["head"]["lines"]}
+    write_atomically(
+        path, code.render("model.py.jinja", feed_forward=False, supplement=supplement, effects=effects, head=head)
+    )
+    # Omissions with a reason are corrections of recordings, which are no torques of the arm.
+    lost = [each.part for each in sheet.omitted if each in code.sheet.omitted and not each.reason]
+    instead = "" if rigid else ", with dry friction instead of that of the program"
+    remark = f"{path.name} computes the torques that the file lacks{instead}{'; not: ' * bool(lost)}{'; '.join(lost)}"
+    return replace(sheet, remarks=(*sheet.remarks, remark))
 
 
 def code_of(model: ExportedModel, format_name: str) -> Code:
@@ -85,7 +115,7 @@ def code_of(model: ExportedModel, format_name: str) -> Code:
     ]
     frames = zip(chain.cos_alpha, chain.sin_alpha, chain.d, chain.theta, chain.r, chain.prismatic, strict=True)
     effects = [
-        {"title": model.effects[number].title, "torques": list(torques.items())}
+        {"number": number, "title": model.effects[number].title, "torques": list(torques.items())}
         for number, torques in sorted(instant.torques.items())
     ]
     formulas = [text for torques in instant.torques.values() for text in torques.values()]
@@ -144,9 +174,12 @@ def _head(model: ExportedModel, sheet: LimitationSheet) -> list[str]:
     ]
     if sheet.undetermined:
         lines.append(f"Not determined alone by the recordings: {', '.join(sheet.undetermined)}.")
-    # Names of files must end neither a comment of C nor a string of Python.
-    safe = [line.replace("*/", "* /").replace("\\", "/").replace('"', "'") for line in lines]
-    return [part for line in safe for part in wrap(line, WIDTH)]
+    return [part for line in lines for part in wrap(_safe(line), WIDTH)]
+
+
+def _safe(line: str) -> str:
+    """Return a line that ends neither a comment of C nor a string of Python."""
+    return line.replace("*/", "* /").replace("\\", "/").replace('"', "'")
 
 
 def _remarks(model: ExportedModel, instant: InstantModel) -> list[str]:

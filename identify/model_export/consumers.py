@@ -52,23 +52,32 @@ class GivenMotion:
 
 @dataclass(frozen=True, eq=False)
 class ProgramRun:
-    """Torques (N, n) that a program computes at every ``every``-th instant, N m or N; ``remark``: further findings."""
+    """Torques (N, n) that a program computes at every ``every``-th instant, N m or N; ``remark``: further findings.
+
+    ``dry``: its own dry friction in them.
+    """
 
     program: str
     torque: Floats
     remark: str = ""
     every: int = 1
+    dry: Floats | float = 0.0
 
 
 def run_python(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
     """Call the Python module."""
-    module = _module(files[0])
-    memory, torque = [0.0] * len(code_of(model, "python").content["memory"]), []
+    return ProgramRun(f"Python {versions()['python']}", module_torque(model, files[0], motion, "inverse_dynamics"))
+
+
+def module_torque(model: ExportedModel, file: Path, motion: GivenMotion, function: str = "supplement") -> Floats:
+    """Return the torques (N, n) by a function of a Python module."""
+    module, torque = _module(file), []
+    memory = [0.0] * len(code_of(model, "python").content["memory"])
     for row in motion.rows:
         q, qd, qdd = (x.tolist() for x in row)
         memory = module.advance(memory, qd, motion.dt) if memory else memory
-        torque.append(module.inverse_dynamics(q, qd, qdd, *([memory] if memory else ())))
-    return ProgramRun(f"Python {versions()['python']}", np.array(torque))
+        torque.append(getattr(module, function)(q, qd, qdd, *([memory] if memory else ())))
+    return np.array(torque)
 
 
 def run_c(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
@@ -185,27 +194,40 @@ def _pinocchio(pin: Any, arm: Any, motion: GivenMotion) -> ProgramRun:
     """Return the torques by the recursive algorithm, with friction and damping of the file as simulators add them."""
     data, neutral = arm.createData(), pin.neutral(arm)
     rows = [pin.rnea(arm, data, pin.integrate(arm, neutral, q), qd, qdd) for q, qd, qdd in motion.rows]
-    friction = arm.damping * motion.qd + arm.friction * np.sign(motion.qd)
-    return ProgramRun(f"Pinocchio {pin.__version__}", np.array(rows) + friction)
+    dry = arm.friction * np.sign(motion.qd)
+    return ProgramRun(f"Pinocchio {pin.__version__}", np.array(rows) + arm.damping * motion.qd + dry, dry=dry)
 
 
 def run_sdf(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
-    """Let Drake compute the torques, gravity set."""
+    """Let Drake compute the torques, gravity set; what turns behind a gear moves freely."""
     parsing, plants, tree = (_package(f"pydrake.multibody.{part}", "drake") for part in ("parsing", "plant", "tree"))
+    analysis = _package("pydrake.systems.analysis", "drake")
     plant = plants.MultibodyPlant(time_step=0.0)
     parsing.Parser(plant).AddModels(str(files[0]))
     plant.mutable_gravity_field().set_gravity_vector(model.frames.gravity)
     plant.Finalize()
-    context, rows = plant.CreateDefaultContext(), []
+    context, free, rows = plant.CreateDefaultContext(), plant.CreateDefaultContext(), []
     order = [plant.GetJointByName(joint_name(model, k)).velocity_start() for k in range(model.arm.n)]
+    q, qd, qdd, force = np.zeros((4, plant.num_velocities()))
+    behind = np.delete(np.arange(q.size), order)
+    for k in plant.GetJointActuatorIndices():
+        plant.get_joint_actuator(k).SetRotorInertia(free, PRESCRIBED)
+    simulator = analysis.Simulator(plant, free)
     for row in motion.rows:
-        q, qd, qdd = np.zeros((3, len(order)))
         q[order], qd[order], qdd[order] = row
+        if behind.size:
+            force[order] = PRESCRIBED * row[2]
+            plant.get_applied_generalized_force_input_port().FixValue(free, force)
+            plant.SetPositionsAndVelocities(free, np.concatenate([q, qd]))
+            qdd[behind] = plant.EvalTimeDerivatives(free).CopyToVector()[q.size :][behind]
         plant.SetPositions(context, q)
         plant.SetVelocities(context, qd)
         forces = tree.MultibodyForces(plant)
         plant.CalcForceElementsContribution(context, forces)
         rows.append(plant.CalcInverseDynamics(context, qdd, forces)[order])
+        if behind.size:
+            simulator.AdvanceTo(free.get_time() + motion.dt)
+            q[behind], qd[behind] = plant.GetPositions(free)[behind], plant.GetVelocities(free)[behind]
     return ProgramRun(f"Drake {version('drake')}", np.array(rows))
 
 

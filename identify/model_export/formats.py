@@ -6,7 +6,7 @@ from pathlib import Path
 
 from armident.configs import ConfigError
 from armident.identify.documents.files import write_atomically
-from armident.identify.model_export.code_writer import write_c, write_lerobot, write_python
+from armident.identify.model_export.code_writer import write_c, write_lerobot, write_python, write_supplement
 from armident.identify.model_export.consumers import GivenMotion
 from armident.identify.model_export.csv_writer import write_csv
 from armident.identify.model_export.drives_writer import write_drives
@@ -69,9 +69,13 @@ def export_model(
         main.parent.mkdir(parents=True, exist_ok=True)
         further = (motion or motion_of(model),) if chosen.along_motion else ()
         files, sheet = chosen.write(model, main, *further)
+        stem = main.name.removesuffix(chosen.suffix).removesuffix(main.suffix)
+        supplement = main.with_name(f"{stem}_{format_name}_supplement.py")
+        completed = write_supplement(model, files[0], sheet, supplement) if sheet.omitted else None
+        if completed is not None:
+            files, sheet = [*files, supplement], completed
         if motion is not None and format_name in RUNNERS:
             sheet = replace(sheet, measured=measure(model, format_name, files, motion))
-        stem = main.name.removesuffix(chosen.suffix).removesuffix(main.suffix)
         page = main.with_name(f"{stem}_{format_name}_limits.md")
         write_atomically(page, sheet.markdown(f"{model.robot.name} as {chosen.title}"))
     except OSError as error:

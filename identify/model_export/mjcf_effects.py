@@ -7,18 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from armident.identify.model_export.exported_model import ExportedEffect, ExportedModel
+from armident.identify.model_export.rigid_effects import SHAFT_KG, SHAFT_KG_M2, gear_spring
 from armident.identify.model_export.saturated_dampers import SaturatedDamper, saturated_dampers
 from armident.identify.model_export.xml_text import numbers
 from armident.identify.robot.chain import Floats
 
 LEAST_FRICTION = 0.01
 """Friction that Stribeck friction on a bristle falls to where it has no Coulomb friction, relative to its peak."""
-
-LEAST_ROTOR = 1e-3
-"""Least inertia of the motor of a joint with two hinges, relative to the mean inertia of the joint."""
-
-SHAFT_KG, SHAFT_KG_M2 = 1e-6, 1e-9
-"""Mass and inertia of the body of a motor, which MuJoCo needs; its inertia is the armature of its joint."""
 
 STOP = {"solreflimit": "0.002 1", "solimplimit": "0.99 0.9999 1e-5"}
 """Ends of a backlash gap: without rebound, as in the model; the time constant is that of two steps, s."""
@@ -91,19 +86,6 @@ def add_effects(model: ExportedModel, passive: Passive) -> tuple[set[int], list[
     return held, replaced
 
 
-def second_hinges(model: ExportedModel) -> dict[int, ExportedEffect]:
-    """Return the elasticity or backlash of each joint that becomes two hinges, by index of the joint.
-
-    A rotor inertia that the model has in the link cannot be taken from a body, and a joint has one such effect.
-    """
-    found: dict[int, ExportedEffect] = {}
-    for effect in model.effects:
-        possible = effect.parameters.get("compliance", effect.parameters.get("gap", 0.0)) > 0.0
-        if effect.effect in ("joint_elasticity", "backlash") and possible and not effect.parameters.get("rotor"):
-            found.setdefault(effect.joint, effect)
-    return found
-
-
 def on_shaft(body: ET.Element, joint: ET.Element, effect: ExportedEffect) -> ET.Element:
     """Return the body of a motor, which ``joint`` turns, with ``body`` on a second joint about the same axis."""
     shaft = ET.Element("body", {key: str(body.get(key)) for key in ("pos", "xyaxes")}, name=f"{body.get('name')}_motor")
@@ -115,15 +97,8 @@ def on_shaft(body: ET.Element, joint: ET.Element, effect: ExportedEffect) -> ET.
     if effect.effect == "backlash":
         gear.attrib.update(STOP, range=numbers([-0.5 * value["gap"], 0.5 * value["gap"]]))
     else:
-        stiffness = 1.0 / value["compliance"]
-        damping = value["damping"] * stiffness / (np.pi * value["frequency"])
+        stiffness, damping = gear_spring(effect)
         gear.attrib.update(stiffness=numbers(stiffness), damping=numbers(damping))
     body.insert(0, gear)
     shaft.append(body)
     return shaft
-
-
-def motor_inertia(model: ExportedModel, k: int, own: float) -> float:
-    """Return the armature of a joint with two hinges: ``own`` or, where it is less, `LEAST_ROTOR` of the joint's."""
-    still = np.zeros((1, len(model.joints)))
-    return max(own, LEAST_ROTOR * float(model.arm.mass_matrix(model.theta, still)[0, k, k]))

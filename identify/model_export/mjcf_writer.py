@@ -12,8 +12,14 @@ import numpy as np
 
 from armident.identify.model_export.exported_model import ExportedModel, JointCoupling, LinkBody
 from armident.identify.model_export.formulas import instant_model
-from armident.identify.model_export.mjcf_effects import Passive, add_effects, motor_inertia, on_shaft, second_hinges
-from armident.identify.model_export.rigid_effects import SPRINGS, springs, with_rigid_effects
+from armident.identify.model_export.mjcf_effects import Passive, add_effects, on_shaft
+from armident.identify.model_export.rigid_effects import (
+    SPRINGS,
+    motor_inertia,
+    second_hinges,
+    springs,
+    with_rigid_effects,
+)
 from armident.identify.model_export.saturated_dampers import coupling_law, friction_laws, top_speed
 from armident.identify.model_export.sheet import PARTS, LimitationSheet, Omission, limitation_sheet
 from armident.identify.model_export.xml_text import numbers, write_xml

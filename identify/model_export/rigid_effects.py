@@ -1,4 +1,4 @@
-"""Effects that are parameters of the arm in other words: rotor inertias, couplings, direction of gravity, springs."""
+"""Effects that are parameters of the arm in other words: rotor inertias, couplings, gravity, springs, second joints."""
 
 from dataclasses import replace
 
@@ -10,6 +10,12 @@ from armident.identify.model_export.exported_model import ExportedEffect, Export
 
 SPRINGS = "springs"
 """Part of a model that a linear spring is held as."""
+
+LEAST_ROTOR = 1e-3
+"""Least inertia of the motor of a joint with two hinges, relative to the mean inertia of the joint."""
+
+SHAFT_KG, SHAFT_KG_M2 = 1e-6, 1e-9
+"""Mass and inertia of the body of a motor, which simulators need; its inertia is the rotor inertia of its joint."""
 
 
 def with_rigid_effects(model: ExportedModel) -> tuple[ExportedModel, dict[int, str]]:
@@ -51,3 +57,28 @@ def _part(model: ExportedModel, effect: ExportedEffect) -> str | None:
     # A motor that turns with two joints couples them; a spring that pushes away from its centre is none.
     two = part == "rotor inertia" and np.count_nonzero(model.robot.transmission_matrix[effect.joint]) > 1
     return None if not part or two or (part == SPRINGS and effect.parameters.get("ks", 0.0) <= 0.0) else part
+
+
+def second_hinges(model: ExportedModel) -> dict[int, ExportedEffect]:
+    """Return the elasticity or backlash of each joint that becomes two hinges, by index of the joint.
+
+    A rotor inertia that the model has in the link cannot be taken from a body, and a joint has one such effect.
+    """
+    found: dict[int, ExportedEffect] = {}
+    for effect in model.effects:
+        possible = effect.parameters.get("compliance", effect.parameters.get("gap", 0.0)) > 0.0
+        if effect.effect in ("joint_elasticity", "backlash") and possible and not effect.parameters.get("rotor"):
+            found.setdefault(effect.joint, effect)
+    return found
+
+
+def gear_spring(effect: ExportedEffect) -> tuple[float, float]:
+    """Return stiffness and damping of an elastic gear, N m/rad and N m s/rad, or N/m and N s/m."""
+    value = effect.parameters
+    return 1.0 / value["compliance"], value["damping"] / (value["compliance"] * np.pi * value["frequency"])
+
+
+def motor_inertia(model: ExportedModel, k: int, own: float) -> float:
+    """Return the armature of a joint with two hinges: ``own`` or, where it is less, `LEAST_ROTOR` of the joint's."""
+    still = np.zeros((1, len(model.joints)))
+    return max(own, LEAST_ROTOR * float(model.arm.mass_matrix(model.theta, still)[0, k, k]))

@@ -1,17 +1,30 @@
-"""SDFormat, the format of Gazebo and Drake: bodies, friction, springs, and rotor inertias for Drake."""
+"""SDFormat, the format of Gazebo and Drake: bodies, friction, springs, elastic joints, and rotor inertias for Drake."""
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from armident.identify.model_export.exported_model import ExportedModel, LinkBody
-from armident.identify.model_export.rigid_effects import SPRINGS, springs, with_rigid_effects
+from armident.identify.model_export.rigid_effects import (
+    SHAFT_KG,
+    SHAFT_KG_M2,
+    SPRINGS,
+    gear_spring,
+    motor_inertia,
+    second_hinges,
+    springs,
+    with_rigid_effects,
+)
 from armident.identify.model_export.sheet import LimitationSheet, limitation_sheet
 from armident.identify.model_export.xml_text import numbers, roll_pitch_yaw, write_xml
 from armident.identify.robot.chain import Floats
 
 HOLDS = ("rotor inertia", "viscous friction", "Coulomb friction", SPRINGS)
+
+SHAFT = LinkBody("", SHAFT_KG, np.zeros(3), SHAFT_KG_M2 * np.eye(3))
+"""Body of a motor before an elastic gear; its inertia is the rotor inertia of its joint."""
 
 DRAKE = "drake.mit.edu"
 """Namespace of the elements that Drake adds to the format."""
@@ -28,17 +41,31 @@ def write_sdf(model: ExportedModel, out: Path) -> tuple[list[Path], LimitationSh
     parent = model.frames.free_base
     ET.SubElement(arm, "link", name=parent)
     _joint(arm, f"{parent}_to_world", "fixed", "world", parent)
+    # The sides of a backlash are limits of a joint, which Drake's plants of continuous time do not have.
+    elastic = {k: each for k, each in second_hinges(model).items() if each.effect == "joint_elasticity"}
     stiffness = springs(model)
     for k, body in enumerate(model.links):
-        _add_link(arm, body, parent, model.frames.placements[k])
-        _add_joint(arm, model, k, parent, stiffness.get(k, 0.0))
+        joint, placement = model.joints[k], model.frames.placements[k]
+        moved = replace(SHAFT, name=f"{body.name}_motor") if k in elastic else body
+        inertia = motor_inertia(model, k, joint.rotor_inertia) if k in elastic else joint.rotor_inertia
+        _add_link(arm, moved, parent, placement)
+        axis = _add_joint(arm, model, k, parent, moved.name, inertia)
+        _add_dynamics(axis, joint.viscous, joint.coulomb, stiffness.get(k, 0.0))
+        if k in elastic:
+            _add_link(arm, body, moved.name, np.eye(4))
+            gear = _joint(arm, f"{joint_name(model, k)}_gear", joint.type, moved.name, body.name)
+            axis = ET.SubElement(gear, "axis")
+            _text(axis, "xyz", model.frames.axes[k])
+            _text(ET.SubElement(axis, "limit"), "effort", 0.0)
+            spring, damping = gear_spring(elastic[k])
+            _add_dynamics(axis, damping, 0.0, spring)
         parent = body.name
     write_xml(root, out)
     remarks = (
         "the base is fixed to the world; meshes are not copied",
-        "Drake has no Coulomb friction; Gazebo has no rotor inertia",
+        f"Drake has no Coulomb friction; Gazebo has no rotor inertia{', which an elastic joint needs' * bool(elastic)}",
     )
-    return [out], limitation_sheet(model, "sdf", HOLDS, parts=parts, remarks=remarks)
+    return [out], limitation_sheet(model, "sdf", HOLDS, effects=[*elastic.values()], parts=parts, remarks=remarks)
 
 
 def _add_link(arm: ET.Element, body: LinkBody, parent: str, placement: Floats) -> None:
@@ -54,12 +81,12 @@ def _add_link(arm: ET.Element, body: LinkBody, parent: str, placement: Floats) -
         _text(inertia, f"i{'xyz'[i]}{'xyz'[j]}", central[i, j])
 
 
-def _add_joint(arm: ET.Element, model: ExportedModel, k: int, parent: str, stiffness: float) -> None:
-    """Add joint k, whose frame is that of its link."""
-    joint, limits = model.joints[k], model.robot.joints[k].limits
-    kind = "continuous" if model.frames.endless[k] else joint.type
-    element = _joint(arm, joint_name(model, k), kind, parent, model.links[k].name)
-    _text(element, "drake:rotor_inertia", joint.rotor_inertia)
+def _add_joint(arm: ET.Element, model: ExportedModel, k: int, parent: str, child: str, inertia: float) -> ET.Element:
+    """Add joint k, whose frame is that of the link that it moves; return its axis."""
+    limits = model.robot.joints[k].limits
+    kind = "continuous" if model.frames.endless[k] else model.joints[k].type
+    element = _joint(arm, joint_name(model, k), kind, parent, child)
+    _text(element, "drake:rotor_inertia", inertia)
     _text(element, "drake:gear_ratio", 1.0)
     axis = ET.SubElement(element, "axis")
     _text(axis, "xyz", model.frames.axes[k])
@@ -68,9 +95,14 @@ def _add_joint(arm: ET.Element, model: ExportedModel, k: int, parent: str, stiff
     for tag, value in {**bounds, "effort": limits.torque, "velocity": limits.velocity}.items():
         if np.isfinite(value):
             _text(element, tag, value)
+    return axis
+
+
+def _add_dynamics(axis: ET.Element, damping: float, friction: float, stiffness: float) -> None:
+    """Add friction and spring of a joint."""
     dynamics = ET.SubElement(axis, "dynamics")
-    _text(dynamics, "damping", joint.viscous)
-    _text(dynamics, "friction", joint.coulomb)
+    _text(dynamics, "damping", damping)
+    _text(dynamics, "friction", friction)
     if stiffness:
         _text(dynamics, "spring_reference", 0.0)
         _text(dynamics, "spring_stiffness", stiffness)

@@ -33,7 +33,8 @@ class Omission:
 class Measured:
     """Figures of a file: program, motion, torque difference in total and by joint (percent), and remarks.
 
-    ``missing``: reason for which there are no figures; empty if there are.
+    ``missing``: reason for which there are no figures; empty if there are. ``supplement``: module whose torques leave
+    ``error_pct_with_supplement``.
     """
 
     program: str = ""
@@ -42,6 +43,8 @@ class Measured:
     error_pct_by_joint: dict[str, float] | None = None
     remarks: Sequence[str] = ()
     missing: str = ""
+    supplement: str = ""
+    error_pct_with_supplement: float | None = None
 
     def lines(self) -> list[str]:
         """Return the figures as sentences."""
@@ -52,6 +55,8 @@ class Measured:
             f"{self.program} computes torques that differ by {self.error_pct:.2g} % from those of the identified model "
             f"({each}) along {self.motion}"
         )
+        if self.error_pct_with_supplement is not None:
+            found += f", and by {self.error_pct_with_supplement:.2g} % with the torques of {self.supplement}"
         return [found, *self.remarks]
 
     def document(self) -> dict[str, Any]:
@@ -61,7 +66,10 @@ class Measured:
 
 @dataclass(frozen=True)
 class LimitationSheet:
-    """Limits of an exported file: parts held and omitted, undetermined parameters with the reason, remarks, figures."""
+    """Limits of an exported file: parts held and omitted, undetermined parameters with the reason, remarks, figures.
+
+    ``holds``: parts that the format has; ``effects``: numbers of the effects that the file has.
+    """
 
     format_name: str
     held: tuple[str, ...]
@@ -69,6 +77,8 @@ class LimitationSheet:
     undetermined: dict[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     measured: Measured | None = None
+    holds: frozenset[str] = frozenset()
+    effects: frozenset[int] = frozenset()
 
     def markdown(self, title: str) -> str:
         """Return the sheet as a Markdown page. ``title``: first heading."""
@@ -152,7 +162,13 @@ def limitation_sheet(
         else:
             omitted.append(Omission(effect_in_words(model, effect)))
     return LimitationSheet(
-        format_name, tuple(held), tuple(omitted), model.undetermined, (*_about_estimate(model), *remarks)
+        format_name,
+        tuple(held),
+        tuple(omitted),
+        model.undetermined,
+        (*_about_estimate(model), *remarks),
+        holds=frozenset(holds),
+        effects=frozenset(k for k, each in enumerate(model.effects) if each in effects or parts.get(k) in holds),
     )
 
 

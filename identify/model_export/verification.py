@@ -62,12 +62,15 @@ def measure(model: ExportedModel, format_name: str, files: Sequence[Path], motio
         return Measured(missing=str(error))
     expected = identified_torque(model, motion)[:: run.every]
     settled = min(round(SETTLED_S / motion.dt / run.every), len(expected) // 5)
-    compared, title = (run.torque - expected, expected), motion.title
+    supplement = next((file for file in files if file.name.endswith("_supplement.py")), None)
+    added = 0.0 if supplement is None else consumers.module_torque(model, supplement, motion) - run.dry
+    compared, title = [expected, run.torque - expected, run.torque + added - expected], motion.title
     period = motion.dt * run.every
     if any(effect.effect == "backlash" for effect in model.effects) and period < 0.5 / IMPACT_BAND_HZ:
-        compared = (butterworth(compared[0], period, IMPACT_BAND_HZ), butterworth(compared[1], period, IMPACT_BAND_HZ))
+        compared = [butterworth(torque, period, IMPACT_BAND_HZ) for torque in compared]
         title += f", below {IMPACT_BAND_HZ:g} Hz"
-    errors, sizes = (np.linalg.norm(torque[settled:], axis=0) for torque in compared)
+    sizes, errors, remaining = (np.linalg.norm(torque[settled:], axis=0) for torque in compared)
+    size = max(float(np.linalg.norm(sizes)), 1e-300)
     moved = identified_torque(model, motion, model.theta)[:: run.every] - expected
     physical = 100.0 * float(np.linalg.norm(moved) / max(float(np.linalg.norm(expected)), 1e-300))
     remarks = [run.remark, f"the step to a physical arm alone changes them by {physical:.2g} %"]
@@ -75,9 +78,11 @@ def measure(model: ExportedModel, format_name: str, files: Sequence[Path], motio
     return Measured(
         run.program,
         title,
-        float(100.0 * np.linalg.norm(errors) / max(float(np.linalg.norm(sizes)), 1e-300)),
+        float(100.0 * np.linalg.norm(errors) / size),
         {joint.name: float(value) for joint, value in zip(model.joints, by_joint, strict=True)},
         [remark for remark in remarks if remark],
+        supplement="" if supplement is None else supplement.name,
+        error_pct_with_supplement=None if supplement is None else float(100.0 * np.linalg.norm(remaining) / size),
     )
 
 

@@ -99,15 +99,20 @@ def share(model: ExportedModel) -> str:
 
 
 def cell(model: ExportedModel, format_name: str, folder: Path) -> str:
-    """Return the figure of a format, and if it leaves the effect out."""
+    """Return the figure of a format; a second one with its module of what it leaves out, or that it leaves it out."""
     _, sheet = export_model(model, format_name, folder / format_name, motion_of(model))
     found = sheet.measured
     assert found is not None
     if found.error_pct is None:
         return found.missing
     kept = all(any(effect.title in part for part in sheet.held) for effect in model.effects)
-    figure = "0" if found.error_pct < 1e-6 else f"{found.error_pct:.2g}"
-    return f"{figure} %{'' if kept else ', left out'}"
+    if found.error_pct_with_supplement is not None:
+        return f"{_percent(found.error_pct)}; {_percent(found.error_pct_with_supplement)}"
+    return f"{_percent(found.error_pct)}{'' if kept else ', left out'}"
+
+
+def _percent(value: float) -> str:
+    return "0 %" if value < 1e-5 else f"{value:.2g} %"
 
 
 if __name__ == "__main__":
