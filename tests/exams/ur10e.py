@@ -94,7 +94,8 @@ class Published:
         motion = zip(q, qd, qdd, strict=True)
         links = [pinocchio.computeJointTorqueRegressor(self.geometry, data, *now) @ self.links for now in motion]
         viscous, coulomb, offset = self.friction.T
-        return np.array(links) + self.rotors * qdd + viscous * qd + coulomb * np.sign(qd) + offset
+        torque: Floats = np.array(links) + self.rotors * qdd + viscous * qd + coulomb * np.sign(qd) + offset
+        return torque
 
 
 def recording(folder: Path, stretch: Stretch, gains: Floats) -> armident.Recording:
