@@ -144,7 +144,8 @@ def report(folder: Path | None) -> str:
     found = armident.diagnose(training)
     seconds = time.process_time() - begin
     unloaded, loaded = (recording(folder, stretch, published.gains) for stretch in (UNLOADED, LOADED))
-    changed = armident.diagnose(loaded, baseline=armident.identify(unloaded))
+    baseline = armident.identify(unloaded, robot=found.robot)
+    changed = armident.diagnose(loaded, robot=found.robot, baseline=baseline)
     models = {
         "published parameters": published.torques,
         "ours, rigid": of(armident.identify(training)),

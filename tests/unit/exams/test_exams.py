@@ -11,7 +11,7 @@ from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import simulate
-from tests.exams import emps, friction, ur10e
+from tests.exams import emps, friction, tx40, ur10e
 from tests.reproduction.recordings import EMPS_FILE, EMPS_PERIOD
 from tests.tools.command_line import NAME, laboratory
 
@@ -24,6 +24,7 @@ SWITCHING = 1e7
     ("arguments", "place"),
     [
         (["emps", "--data", "{folder}"], "nonlinearbenchmark.org"),
+        (["tx40", "--data", "{folder}"], "figaroh-examples"),
         (["friction", "--data", "{folder}"], friction.REPOSITORY),
         (["friction"], friction.REPOSITORY),
         (["ur10e", "--data", "{folder}"], ur10e.REPOSITORY),
@@ -110,6 +111,13 @@ def test_the_forearm_follows_the_programmed_path_from_the_start_posture() -> Non
     assert np.ptp(moving) > 0.3
     record = replace(known_record(0.1, 0.0), forearm=np.zeros(10_000))
     assert record.rigid.shape == (10_000, 8)
+
+
+@pytest.mark.slow
+def test_the_tx40_has_the_parameters_of_both_published_estimates(shared_data: Path) -> None:
+    if not (shared_data / "tx40").is_dir():
+        pytest.skip("no tx40 folder in the measured data")
+    assert "45 of 45 published values agree" in tx40.report(shared_data)
 
 
 def test_the_published_model_of_the_ur10e_explains_a_recording_of_itself(tmp_path: Path) -> None:
