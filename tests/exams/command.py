@@ -27,8 +27,8 @@ def exam(
         Path | None,
         typer.Option(
             help="Folder of the recordings. For emps and tx40 the parent of the folder of that name, by default "
-            "$ARMIDENT_SHARED_DATA or ../shared/data; for friction and ur10e a clone of the repository that the command "
-            "names."
+            "$ARMIDENT_SHARED_DATA or ../shared/data; for friction and ur10e a clone of the repository that the "
+            "command names."
         ),
     ] = None,
 ) -> None:
