@@ -52,7 +52,7 @@ class Stretch:
 
 TRAINING = Stretch("30 s, 12 harmonics", "identification_data/ur-20_02_10-30sec_12harm.csv", 635, 3510)
 HELD_OUT = (
-    Stretch("10 points, held out", "validation_data/ur-20_01_17-ptp_10_points.csv", 700, 4200),
+    Stretch("10 points, used to judge the findings", "validation_data/ur-20_01_17-ptp_10_points.csv", 700, 4200),
     Stretch("40 s, 12 harmonics, held out", "identification_data/ur-20_02_12-40sec_12harm.csv", 500, 4460),
 )
 UNLOADED = Stretch("50 s, 14 harmonics", "identification_data/ur-20_02_19_14harm50sec.csv", 195, 4966)
@@ -141,11 +141,10 @@ def report(folder: Path | None) -> str:
     seen = {stretch: recording(folder, stretch, published.gains) for stretch in (TRAINING, *HELD_OUT)}
     training = seen[TRAINING]
     begin = time.process_time()
-    found = armident.diagnose(training)
+    found = armident.diagnose(training, validate=seen[HELD_OUT[0]])
     seconds = time.process_time() - begin
     unloaded, loaded = (recording(folder, stretch, published.gains) for stretch in (UNLOADED, LOADED))
-    baseline = armident.identify(unloaded, robot=found.robot)
-    changed = armident.diagnose(loaded, robot=found.robot, baseline=baseline)
+    changed = armident.diagnose(loaded, baseline=armident.identify(unloaded))
     models = {
         "published parameters": published.torques,
         "ours, rigid": of(armident.identify(training)),
