@@ -138,7 +138,7 @@ def test_the_published_model_of_the_ur10e_explains_a_recording_of_itself(tmp_pat
     t = np.arange(ur10e.TRAINING.last + 50) / ur10e.RATE_HZ
     w = np.linspace(0.5, 1.0, 6)
     q, qd, qdd = np.sin(np.outer(t, w)), w * np.cos(np.outer(t, w)), -(w**2) * np.sin(np.outer(t, w))
-    for stretch in (ur10e.TRAINING, *ur10e.HELD_OUT, ur10e.UNLOADED, ur10e.LOADED):
+    for stretch in (ur10e.TRAINING, ur10e.SECOND, *ur10e.HELD_OUT, ur10e.LOADED):
         (tmp_path / ur10e.FOLDER / stretch.file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / ur10e.FOLDER / stretch.file).touch()
     published = ur10e.Published.read(tmp_path)
