@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tests.exams import emps, friction
+from tests.exams import emps, friction, tx40, ur10e
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -17,6 +17,8 @@ class Exam(StrEnum):
 
     EMPS = "emps"
     FRICTION = "friction"
+    TX40 = "tx40"
+    UR10E = "ur10e"
 
 
 def exam(
@@ -24,8 +26,9 @@ def exam(
     data: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the recordings. For emps the parent of the folder emps, by default $ARMIDENT_SHARED_DATA "
-            "or ../shared/data; for friction a clone of the repository that the command names."
+            help="Folder of the recordings. For emps and tx40 the parent of the folder of that name, by default "
+            "$ARMIDENT_SHARED_DATA or ../shared/data; for friction and ur10e a clone of the repository that the "
+            "command names."
         ),
     ] = None,
 ) -> None:
@@ -33,8 +36,8 @@ def exam(
 
     Example: python -m tests.exams emps
     """
-    if name is Exam.EMPS:
+    if name in (Exam.EMPS, Exam.TX40):
         shared = Path(os.environ.get("ARMIDENT_SHARED_DATA") or REPOSITORY.parent / "shared" / "data")
-        print(emps.report(data or shared))
+        print((emps if name is Exam.EMPS else tx40).report(data or shared))
     else:
-        print(friction.report(data))
+        print((friction if name is Exam.FRICTION else ur10e).report(data))

@@ -11,7 +11,7 @@ from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import simulate
-from tests.exams import emps, friction
+from tests.exams import emps, friction, tx40, ur10e
 from tests.reproduction.recordings import EMPS_FILE, EMPS_PERIOD
 from tests.tools.command_line import NAME, laboratory
 
@@ -24,8 +24,11 @@ SWITCHING = 1e7
     ("arguments", "place"),
     [
         (["emps", "--data", "{folder}"], "nonlinearbenchmark.org"),
+        (["tx40", "--data", "{folder}"], "figaroh-examples"),
         (["friction", "--data", "{folder}"], friction.REPOSITORY),
         (["friction"], friction.REPOSITORY),
+        (["ur10e", "--data", "{folder}"], ur10e.REPOSITORY),
+        (["ur10e"], ur10e.REPOSITORY),
     ],
 )
 def test_without_recordings_one_line_says_where_to_get_them(arguments: list[str], place: str, tmp_path: Path) -> None:
@@ -108,3 +111,43 @@ def test_the_forearm_follows_the_programmed_path_from_the_start_posture() -> Non
     assert np.ptp(moving) > 0.3
     record = replace(known_record(0.1, 0.0), forearm=np.zeros(10_000))
     assert record.rigid.shape == (10_000, 8)
+
+
+@pytest.mark.slow
+def test_the_tx40_has_the_parameters_of_both_published_estimates(shared_data: Path) -> None:
+    if not (shared_data / "tx40").is_dir():
+        pytest.skip("no tx40 folder in the measured data")
+    assert "45 of 45 published values agree" in tx40.report(shared_data)
+
+
+def test_the_published_model_of_the_ur10e_explains_a_recording_of_itself(tmp_path: Path) -> None:
+    """An arm of six joints about one horizontal axis, whose last link alone has mass; rows around the stretch."""
+    joints = "".join(
+        f'<link name="l{k + 1}"/><joint name="j{k}" type="revolute"><parent link="l{k}"/><child link="l{k + 1}"/>'
+        '<axis xyz="0 1 0"/><limit lower="-6" upper="6" effort="9" velocity="9"/></joint>'
+        for k in range(6)
+    )
+    (tmp_path / ur10e.GEOMETRY).parent.mkdir(parents=True)
+    (tmp_path / ur10e.GEOMETRY).write_text(f'<robot name="arm"><link name="l0"/>{joints}</robot>')
+    last = [0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.7, 0.0, 0.0, 2.0]  # inertia about y, first moment along x, mass
+    values = {
+        "drvGains": [10.0] * 6, "pi_drvs": [0.1] * 6, "pi_frcn": [3.0, 2.0, 0.5] * 6, "pi_rgd": [0.0] * 50 + last,
+    }  # fmt: skip
+    text = "\n".join(f"{name} = [{' '.join(map(str, row))}]" for name, row in values.items())
+    (tmp_path / ur10e.PARAMETERS).write_text(text)
+    t = np.arange(ur10e.TRAINING.last + 50) / ur10e.RATE_HZ
+    w = np.linspace(0.5, 1.0, 6)
+    q, qd, qdd = np.sin(np.outer(t, w)), w * np.cos(np.outer(t, w)), -(w**2) * np.sin(np.outer(t, w))
+    for stretch in (ur10e.TRAINING, ur10e.SECOND, *ur10e.HELD_OUT, ur10e.LOADED):
+        (tmp_path / ur10e.FOLDER / stretch.file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / ur10e.FOLDER / stretch.file).touch()
+    published = ur10e.Published.read(tmp_path)
+    torque = published.torques(q, qd, qdd)
+    own = 0.1 * qdd + 3.0 * qd + 2.0 * np.sign(qd) + 0.5
+    load = 0.5 * qdd.sum(axis=1) - 0.7 * 9.81 * np.cos(q.sum(axis=1))
+    assert torque == pytest.approx(own + load[:, None], abs=1e-9)
+    torque[: ur10e.TRAINING.first - 1] += 1e3  # rows before the stretch count for nothing
+    np.savetxt(tmp_path / ur10e.FOLDER / ur10e.TRAINING.file, np.column_stack([t, q, qd, torque / 10.0]), delimiter=",")
+    seen = {ur10e.TRAINING: ur10e.recording(tmp_path, ur10e.TRAINING, published.gains)}
+    ((_, _, *errors),) = ur10e.rows({"itself": published.torques}, seen)
+    assert max(map(float, errors)) < 3.0  # a sample of the wrong sign of Coulomb friction at a reversal
