@@ -166,7 +166,8 @@ def renew_authority(folder: Path) -> None:
 def revoke(folder: Path, name: str) -> None:
     """Remove a name from the access control of the router, and keep it from being enrolled again."""
     read_authority(folder)
-    _known(folder, name)
+    if _known(folder, name).role == "router":
+        raise ConfigError(f"{name}: a router is not revoked: make a new authority (keys init), and enrol all names")
     (folder / f"{name}.pem").rename(_revoked(folder, name))
     (folder / f"{name}.key").unlink(missing_ok=True)
     write_router(folder)

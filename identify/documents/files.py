@@ -3,6 +3,7 @@
 import json
 import os
 import secrets
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,9 +24,7 @@ def to_json(document: BaseModel) -> str:
 def from_json(text: str, kind: type[T], where: str) -> T:
     """Return the document of a JSON text; DataError names ``where``, the key and the expected value."""
     try:
-        return kind.model_validate(json.loads(text))
-    except json.JSONDecodeError as error:
-        raise DataError(f"{where}: line {error.lineno}: not valid JSON: {error.msg}") from error
+        return kind.model_validate(_parsed(text, where))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "document"
@@ -39,12 +38,26 @@ def load_document(path: Path, kind: type[T]) -> T:
 
 def read_json(path: Path) -> dict[str, Any]:
     """Return the JSON object of a file; ConfigError if there is none, DataError if it is no JSON object."""
-    try:
-        found = json.loads(_text(path))
-    except json.JSONDecodeError as error:
-        raise DataError(f"{path}: line {error.lineno}: not valid JSON: {error.msg}") from error
+    found = _parsed(_text(path), str(path))
     if not isinstance(found, dict):
         raise DataError(f"{path}: expected a JSON object")
+    return found
+
+
+def _parsed(text: str, where: str) -> Any:
+    """Return the content of a JSON text; one in which a key stands twice has two meanings, and is refused."""
+    try:
+        return json.loads(text, object_pairs_hook=_unique)
+    except json.JSONDecodeError as error:
+        raise DataError(f"{where}: line {error.lineno}: not valid JSON: {error.msg}") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{where}: not valid JSON: {error}") from error
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError(f"the key {Counter(key for key, _ in pairs).most_common(1)[0][0]!r} twice")
     return found
 
 

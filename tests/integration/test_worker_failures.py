@@ -136,6 +136,47 @@ def test_a_full_disk_is_reported_and_the_result_written_when_there_is_space(
     assert states(tmp_path) == {"emps-a": ("done", True)}
 
 
+def test_a_folder_of_a_result_that_refuses_it_holds_up_no_other(session: SessionConfig, tmp_path: Path) -> None:
+    made = recorded(session, "b", 1)
+    recorded(session, "$(c) [x]", 2)
+    (tmp_path / "emps-$(c) [x].identification").touch()
+    os.utime(tmp_path / "emps-b.mcap", (0.0, 0.0))
+    with Worker(session, made.robot, tmp_path) as worker:
+        assert [worker.result(LONGEST_S), worker.result(LONGEST_S)] == [2, 0]
+        entry = next(each for each in Ledger(tmp_path / FILE, "test").entries() if each.state == "failed")
+        assert (entry.message or "").endswith("then: armident queue retry 'emps-$(c) [x]'")
+        (tmp_path / "emps-$(c) [x].identification").unlink()
+        assert Ledger(tmp_path / FILE, "test").change("retry", [entry.name]) == [entry.name]
+        assert worker.result(LONGEST_S) == 0
+    assert states(tmp_path) == {"emps-b": ("done", True), "emps-$(c) [x]": ("done", True)}
+
+
+@pytest.mark.parametrize("change", ["cut", "signature", "other", "folder"])
+def test_a_result_that_is_damaged_before_its_announcement_holds_up_no_other(
+    session: SessionConfig, tmp_path: Path, change: str
+) -> None:
+    made = recorded(session, "a", 1)
+    with Worker(session, made.robot, tmp_path) as worker:
+        assert worker.result(LONGEST_S) == 0
+    file, ledger = tmp_path / "emps-a.identification" / "identification.json", Ledger(tmp_path / FILE, "test")
+    with ledger._transaction() as db:
+        # As if Zenoh had been away until now.
+        db.execute("UPDATE experiments SET announced = 0")
+    text = file.read_text()
+    if change == "folder":
+        file.unlink()
+        file.mkdir()
+    else:
+        other = json.loads(text) | {"signature": {"certificate": "", "value": ""}}
+        file.write_text(
+            {"cut": text[:1000], "signature": json.dumps(other), "other": text.replace(made.sha256, "0" * 64)}[change]
+        )
+    recorded(session, "b", 2)
+    with Worker(session, made.robot, tmp_path) as worker:
+        assert [worker.result(LONGEST_S), worker.result(LONGEST_S)] == [0, 0]
+    assert states(tmp_path) == {"emps-a": ("done", True), "emps-b": ("done", True)}
+
+
 def test_the_watchdog_is_fed_while_the_work_advances_and_not_while_it_hangs(
     session: SessionConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -202,6 +202,28 @@ def test_a_file_that_is_replaced_under_its_name_gets_a_result_of_its_new_content
     assert results == {first.sha256, second.sha256}
 
 
+def test_a_copy_that_overwrites_an_older_file_in_place_is_read_when_it_is_complete(
+    session: SessionConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = recorded(session, "a", 1)
+    path = tmp_path / "emps-a.mcap"
+    data = path.read_bytes()
+    middle = len(data) // 5
+    path.write_bytes(data[:middle] + bytes(1000) + data[middle + 1000 :])
+    with Worker(session, ROBOT, tmp_path) as worker:
+        assert worker.result(8.0) is None
+        assert (
+            "emps-a: it is damaged, and changed in the last 60 s, as in a copy under way; trying again" in caplog.text
+        )
+        with path.open("r+b") as file:
+            file.seek(middle)
+            file.write(data[middle : middle + 1000])
+        assert worker.result(LONGEST_S) == 0
+    (entry,) = entries(tmp_path).values()
+    assert (entry.state, entry.digest) == ("done", made.sha256)
+    assert len(list(tmp_path.glob("*.identification"))) == 1
+
+
 def read_and_killed(session: SessionConfig, folder: Path) -> None:
     """Read the only recording as a worker that is killed before it has a result."""
     ledger = Ledger(folder / FILE, "killed", lease_s=0.0)

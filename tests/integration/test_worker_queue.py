@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -88,6 +89,8 @@ def test_what_is_passed_over_or_waits_is_said_once_with_its_reason(
     caplog.set_level(logging.INFO)
     recorded(session.model_copy(update={"cell": "other"}), "a")
     (tmp_path / "emps-b.mcap").symlink_to(tmp_path / "nowhere")
+    for name in (b"emps-\xe9.mcap", b"emps-\n.mcap", b"emps-" + 230 * b"n" + b".mcap"):
+        shutil.copy(os.fsencode(tmp_path / "emps-a.mcap"), os.path.join(os.fsencode(tmp_path), name))
     (tmp_path / "emps-c.mcap").write_bytes(b"no recording\x89MCAP0\r\n")
     os.mkfifo(tmp_path / "emps-d.mcap")
     made = recorded(session, "e")
@@ -102,9 +105,30 @@ def test_what_is_passed_over_or_waits_is_said_once_with_its_reason(
         "emps-b.mcap: no file, but a link that leads nowhere, a folder or a pipe; it waits",
         "emps-c.mcap: not a recording (not an MCAP file); passed over",
         "emps-d.mcap: no file, but a link that leads nowhere, a folder or a pipe; it waits",
+        "nnn.mcap: its name has more than 230 bytes; rename it; it waits",
     ):
         assert caplog.text.count(text) == 1, caplog.text
+    assert caplog.text.count("its name is not UTF-8, or has control characters") == 2
     assert entries(tmp_path)["emps-e"].digest == made.sha256
+
+
+def test_a_worker_says_that_a_folder_is_missing_and_refuses_a_file(
+    session: SessionConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    missing = session.model_copy(
+        update={"recording": session.recording.model_copy(update={"directory": tmp_path / "later"})}
+    )
+    text = f"{tmp_path / 'later'}: no such folder; it is searched as soon as it is there"
+    with Worker(missing, ROBOT, tmp_path / "out") as worker:
+        wait_for(lambda: text in caplog.text)
+        (tmp_path / "later").mkdir()
+        recorded(missing, "a")
+        assert worker.result(LONGEST_S) == 0
+    assert caplog.text.count(text) == 1
+    (tmp_path / "file").touch()
+    code, _, err = call("worker", "--config", "emps_cell.yaml", "--out", tmp_path / "file")
+    assert (code, err) == (2, f"armident: {tmp_path / 'file'}: a file, expected a folder\n")
 
 
 def test_an_internal_error_is_tried_again_by_another_version_and_by_queue_retry(

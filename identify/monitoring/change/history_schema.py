@@ -115,6 +115,8 @@ MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (tables.create_all, _o
 def engine_for(url: str) -> sa.Engine:
     """Return the engine of a database, whose transactions on SQLite wait for other processes."""
     if not url.startswith("sqlite"):
+        if url.count("@") > 1 or re.search("password=[^&]*@", url, re.IGNORECASE):
+            raise ConfigError("an @ in user or password of the URL is written %40")
         try:
             return _server_engine(sa.make_url(url))
         except ValueError as error:
@@ -128,13 +130,12 @@ def engine_for(url: str) -> sa.Engine:
 
 def shown(url: str) -> str:
     """Return a URL with its passwords masked, also those of its query and those with characters not quoted."""
-    return re.sub(r"([?&][^=&]*password=)[^&]*", r"\1***", re.sub(r":(?!//).*@", ":***@", url))
+    masked = re.sub(r":(?!//)(.*password=[^&]*@[^&]*|.*@)", ":***@", url, flags=re.IGNORECASE)
+    return re.sub(r"([?&][^=&]*password=)[^&]*", r"\1***", masked, flags=re.IGNORECASE)
 
 
 def _server_engine(url: sa.URL) -> sa.Engine:
     """Return the engine of a database server; on PostgreSQL nothing is waited for longer than `BUSY_S`."""
-    if "@" in (url.host or ""):
-        raise ConfigError("an @ in user or password of the URL is written %40")
     credential = Path(os.environ.get("CREDENTIALS_DIRECTORY", "/nowhere"), CREDENTIAL)
     if url.password is None and "password" not in url.query and credential.is_file():
         url = url.set(password=credential.read_text(encoding="utf-8").rstrip("\n"))

@@ -1,11 +1,13 @@
 """Announcements of a worker: each result and failure in the ledger is announced once, also if workers are killed."""
 
 import logging
+from contextlib import suppress
 
 from armident.configs import ArmidentError
 from armident.daq.streaming import Keys
 from armident.identify.documents.signing import is_signed_in_time, sign_file
 from armident.identify.monitoring.worker.ledger import Ledger, LedgerEntry
+from armident.identify.monitoring.worker.recorded import result_of
 from armident.identify.monitoring.worker.results import prune_results
 from armident.identify.monitoring.worker.status_messages import failure_status, status_message
 from armident.identify.monitoring.worker.worker_link import LinkDown, WorkerLink
@@ -75,10 +77,11 @@ def _outcome(entry: LedgerEntry) -> tuple[bytes | None, str]:
     """Return the document of a result and its verdict; ``None`` and the reason if there is none."""
     if entry.result is None:
         return None, entry.message or ""
-    try:
-        return entry.result.read_bytes(), entry.message or ""
-    except FileNotFoundError:
-        return None, f"{entry.result}: the result was removed before it was announced"
+    with suppress(OSError, ValueError, KeyError):
+        if result_of(entry.sha256, entry.result.parent) is not None:
+            is_signed_in_time(document := entry.result.read_bytes())
+            return document, entry.message or ""
+    return None, f"{entry.result}: the result was removed or changed before it was announced"
 
 
 def _contents(entry: LedgerEntry) -> list[bytes]:

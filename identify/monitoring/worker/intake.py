@@ -20,6 +20,7 @@ from armident.identify.monitoring.worker.recorded import (
     captured_as,
     captured_in,
     check_origin,
+    fault_of_name,
     result_of,
     stamp_of,
 )
@@ -95,6 +96,8 @@ class Intake:
 
     def scan(self, ledger: Ledger, folders: Sequence[Path]) -> None:
         """Enter the finished recordings of folders that the ledger does not know; none is read."""
+        for folder in folders:
+            self._say(folder, None if folder.is_dir() else "no such folder; it is searched as soon as it is there")
         fresh = [each for each in captured_in(folders, self._robot) if self._is_new(each)]
         if not fresh:
             return
@@ -115,6 +118,9 @@ class Intake:
             check_origin(recording, None if entry.any_cell else self._cell, self._robot)
             if captured.stamps != before:
                 raise ConfigError("it changed while it was read")
+            if recording.missing is not None and abs(time.time() - captured.found().made) < STILL_S:
+                # A copy over an older file, or into reserved space, may have an end from its begin.
+                raise ConfigError(f"it is damaged, and changed in the last {STILL_S:g} s, as in a copy under way")
         except (ConfigError, OSError) as error:
             # It may be deleted, or on a disk that is mounted again later.
             reason = reason_of(error) if isinstance(error, OSError) else str(error)
@@ -178,14 +184,21 @@ class Intake:
         except OSError as error:
             reason = reason_of(error, named=False)
         if reason is None:
-            self._said.pop(path, None)
             self._changed.pop(path, None)
-        elif self._said.get(path) != reason:
-            log.info("%s: %s; it waits", path, reason)
-            self._said[path] = reason
+        self._say(path, None if reason is None else f"{reason}; it waits")
         return reason is None
 
+    def _say(self, path: Path, reason: str | None) -> None:
+        """Report a reason once while it lasts."""
+        if reason is None:
+            self._said.pop(path, None)
+        elif self._said.get(path) != reason:
+            log.info("%s: %s", path, reason)
+            self._said[path] = reason
+
     def _not_finished(self, path: Path) -> str | None:
+        if (fault := fault_of_name(path)) is not None:
+            return fault
         if not path.is_file():
             return "no file, but a link that leads nowhere, a folder or a pipe"
         if is_being_written(path):

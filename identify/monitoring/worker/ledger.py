@@ -402,12 +402,12 @@ class Ledger:
             )
 
     def change(self, action: str, patterns: Sequence[str]) -> list[str]:
-        """Retry or ignore recordings without a result whose names match patterns (GLOB); return the names."""
+        """Retry or ignore recordings without a result whose names are these or match them (GLOB); return the names."""
         changed = []
         with self._transaction() as db:
             for pattern in patterns:
                 row = {"pattern": pattern, **ACTIONS[action]}
-                where = " WHERE name GLOB :pattern AND state NOT IN ('done', :state)"
+                where = " WHERE (name = :pattern OR name GLOB :pattern) AND state NOT IN ('done', :state)"
                 changed += [name for (name,) in db.execute(f"SELECT name FROM experiments{where} ORDER BY name", row)]
                 db.execute(_RESET + where, row)
         return changed

@@ -23,7 +23,9 @@ def queue_command(action: str, names: Sequence[str], config: Path | None, out: P
         raise ConfigError(f"{folder / FILE}: no worker has used this folder; give its --out")
     ledger = Ledger(folder / FILE, unique_owner())
     if action == "list":
-        entries = [each for each in ledger.entries() if not names or any(fnmatchcase(each.name, n) for n in names)]
+        entries = ledger.entries()
+        if names:
+            entries = [each for each in entries if each.name in names or any(fnmatchcase(each.name, n) for n in names)]
         _show(entries, as_json=as_json)
         return
     if not names:

@@ -1,6 +1,7 @@
 """Recordings of a cell in folders: the files of each capture, whether they are finished, and earlier results."""
 
 import glob
+import os
 import re
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -20,7 +21,9 @@ MOST_BYTES = 3_500_000_000
 """Largest size of a recording that is read, bytes of its unpacked records: an hour of six axes at 5 kHz (190 bytes a
 row), which is identified in less than 4 GB."""
 
-_PART = re.compile(r"(?P<name>.+?)(?:\.\d{4,})?\.mcap")
+_PART = re.compile(r"(?P<name>.+?)(?:\.\d{4,})?\.mcap", re.DOTALL)
+_UNNAMEABLE = re.compile("[\x00-\x1f\x7f\ud800-\udfff]")
+"""Letters that ledgers, messages and logs cannot have in a path: bytes that are not UTF-8, and control characters."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,15 @@ class Captured:
         return join_parts([read_recording(path) for path in self.paths])
 
 
+def fault_of_name(path: Path) -> str | None:
+    """Return why a file cannot be entered under its name; ``None`` if it can."""
+    if _UNNAMEABLE.search(str(path)):
+        return "its name is not UTF-8, or has control characters; rename it, or its folder"
+    if len(os.fsencode(path.name)) > 230:  # The name of its result is longer, and has at most 255.
+        return "its name has more than 230 bytes; rename it"
+    return None
+
+
 def stamp_of(path: Path) -> str:
     """Return size and time of change of a file; an empty text if it has vanished."""
     try:
@@ -102,7 +114,7 @@ def captured_as(paths: Iterable[Path]) -> list[Captured]:
     found: dict[str, list[Path]] = {}
     for path in paths:
         match = _PART.fullmatch(path.name)
-        if match is not None and is_recording(path):
+        if match is not None and fault_of_name(path.resolve()) is None and is_recording(path):
             found.setdefault(match["name"], []).append(path.resolve())
     return [Captured(name, tuple(sorted(files, key=in_order))) for name, files in found.items()]
 

@@ -5,11 +5,12 @@ import json
 import re
 import shutil
 import time
+from contextlib import suppress
 
 from armident.configs import ConfigError
 from armident.daq.recording.clock import clock_is_right
 from armident.daq.recording.retention import KEEP
-from armident.identify.monitoring.worker.ledger import Ledger
+from armident.identify.monitoring.worker.ledger import Ledger, LedgerEntry
 
 LARGEST_ANSWER = 64 << 20
 """Size of the documents after which an answer ends, bytes; a document of six axes has 0.1 MB."""
@@ -34,14 +35,22 @@ def results_since(ledger: Ledger, since: str, largest: int = LARGEST_ANSWER) -> 
         entries = [(ms, entry) for ms, entry in entries if ms > after_ms]
     found, size = list[dict[str, object]](), 0
     for ms, entry in entries:
-        text = entry.result.read_text(encoding="utf-8") if entry.result and entry.result.is_file() else "null"
+        text, document = _document_of(entry)
         size += len(text)
         if found and size > largest:
             break
         moment = datetime.datetime.fromtimestamp(ms / 1e3, datetime.UTC).isoformat(timespec="milliseconds")
         what = {"sha256": entry.sha256, "capture": entry.name, "announced": moment, "state": entry.state}
-        found.append(what | {"message": entry.message, "document": json.loads(text)})
+        found.append(what | {"message": entry.message, "document": document})
     return json.dumps({"results": found, "more": len(found) < len(entries)}).encode()
+
+
+def _document_of(entry: LedgerEntry) -> tuple[str, object]:
+    """Return the text of a result and what it holds; empty and ``None`` if it is not there, or damaged."""
+    with suppress(OSError, ValueError, RecursionError):
+        text = entry.result.read_text(encoding="utf-8") if entry.result else ""
+        return text, json.loads(text)
+    return "", None
 
 
 def prune_results(ledger: Ledger, days: float | None) -> None:
@@ -52,7 +61,7 @@ def prune_results(ledger: Ledger, days: float | None) -> None:
     """
     if days is None or not clock_is_right():
         return
-    forgotten = []
+    forgotten, refused = [], None
     for ms, entry in ledger.announced()[:-1]:
         folder = None if entry.result is None else entry.result.parent
         if ms / 1e3 > time.time() - 86_400 * days:
@@ -60,8 +69,14 @@ def prune_results(ledger: Ledger, days: float | None) -> None:
         if folder is not None:
             if folder.with_name(folder.name + KEEP).exists():
                 continue
-            if folder.is_dir():
-                shutil.rmtree(folder)
+            try:
+                if folder.is_dir():
+                    shutil.rmtree(folder)
+            except OSError as error:
+                refused = error
+                continue
         if not any(path.exists() for path in entry.paths):
             forgotten.append(entry.sha256)
     ledger.remove(forgotten)
+    if refused is not None:
+        raise refused

@@ -1,10 +1,13 @@
 """Identification worker: identifies every recording of a cell once, and announces the results on Zenoh."""
 
 import datetime
+import errno
 import importlib.metadata
 import logging
 import math
+import os
 import queue
+import shlex
 import signal
 import threading
 import time
@@ -13,11 +16,11 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from armident.configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
+from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig, SessionConfig, load_robot, load_session
 from armident.configs.reasons import reason_of
 from armident.daq.recording import Recording
 from armident.daq.streaming import Keys
-from armident.identify.identification.identify_recording import identify_recording
+from armident.identify.identification.identify_recording import IdentificationOutcome, identify_recording
 from armident.identify.identification.options import options_of
 from armident.identify.monitoring.worker.announcements import Announcements
 from armident.identify.monitoring.worker.intake import Intake
@@ -51,6 +54,9 @@ RETRY_S, LONGEST_RETRY_S = 1.0, 30.0
 """First and longest wait before a write is tried again, s."""
 LONGEST_STAGE_S = 7200.0
 """Time after which an identification that reports no further stage counts as hung, s."""
+
+_OF_FOLDER = frozenset({errno.EACCES, errno.EPERM, errno.EEXIST, errno.EISDIR, errno.ENOTDIR})
+"""Errors of the folder of a result, such as one of another user; others are of the disk, and waited for."""
 
 VERSION = importlib.metadata.version("armident")
 
@@ -265,7 +271,7 @@ class Worker:
                 code = error.exit_code
             except Exception as error:
                 reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-                step = f"another version tries again, or: armident queue retry {entry.name}"
+                step = f"another version tries again, or: {_retry(entry)}"
                 message = f"{entry.name}: internal error of armident {VERSION} ({reason}); {step}"
                 self._fail(ledger, entry, message, VERSION)
                 log.debug("internal error", exc_info=True)
@@ -306,9 +312,7 @@ class Worker:
             self._link.status("identifying", capture=entry.name, stage=stage, share=share)
 
         outcome = identify_recording(recording, self._robot, self._options, progress)
-        document, report = self._until_possible(
-            "result", lambda: write_identification(outcome, folder, self._link.signer.identity)
-        )
+        document, report = self._until_possible("result", lambda: self._write(entry, outcome, folder))
         for reason in outcome.result.verdict.reasons:
             log.warning("%s: %s. Next: %s", reason.level, reason.message, reason.next_step)
         for warning in outcome.document.warnings:
@@ -320,6 +324,15 @@ class Worker:
             flush=True,
         )
         return document, level
+
+    def _write(self, entry: LedgerEntry, outcome: IdentificationOutcome, folder: Path) -> tuple[Path, Path]:
+        """Write a result; ConfigError if its folder alone refuses it, so that the others do not wait for it."""
+        try:
+            return write_identification(outcome, folder, self._link.signer.identity)
+        except OSError as error:
+            if error.errno not in _OF_FOLDER or not os.access(self._out, os.W_OK):
+                raise
+            raise ConfigError(f"{reason_of(error)}; move {folder} away, then: {_retry(entry)}") from error
 
     def _announce(self, ledger: Ledger, sha256: str) -> None:
         document = self._announcements.make(ledger, sha256)
@@ -348,6 +361,10 @@ class Worker:
             wait = min(2 * wait, LONGEST_RETRY_S)
 
 
+def _retry(entry: LedgerEntry) -> str:
+    return f"armident queue retry {shlex.quote(entry.name)}"
+
+
 def _exit_code(state: State, message: str | None) -> int:
     return DataError.exit_code if state == "failed" or message == "unusable" else 0
 
@@ -360,6 +377,9 @@ def run_worker(config: Path, *, once: bool, out: Path | None, since: datetime.da
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.set())
     folder = out or session.recording.directory
+    for path in (folder, session.recording.directory):
+        if path.exists() and not path.is_dir():
+            raise ConfigError(f"{path}: a file, expected a folder")
     begin = -math.inf if since is None else since.timestamp()
     with closing(Notifier()) as notifier, Worker(session, robot, folder, notifier.progress, begin) as worker:
         print("worker: ready", flush=True)

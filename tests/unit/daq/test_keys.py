@@ -110,6 +110,7 @@ def test_a_plant_is_made_by_the_commands_and_says_who_may_do_what(tmp_path: Path
         (["renew", "viewer.otto"], "no viewer.otto.pem; armident keys show lists"),
         (["revoke", "viewer.otto"], "no viewer.otto.pem"),
         (["revoke", "authority"], "no authority.pem; armident keys show"),
+        (["revoke", "router.werk"], "a router is not revoked: make a new authority"),
         (["list"], "no action 'list'; expected init, enrol"),
         (["show", "--folder", "nowhere"], "no such folder"),
     ],

@@ -71,6 +71,9 @@ def changed(text: str, **changes: Any) -> str:
         (lambda text: changed(text, signature=[]), "damaged"),
         (lambda text: json.dumps({k: v for k, v in json.loads(text).items() if k != "signature"}), "not signed"),
         (lambda text: text[: len(text) // 2], "not valid JSON"),
+        (lambda text: text.replace("{", '{"predictions": [1],', 1), "not valid JSON: the key 'predictions' twice"),
+        (lambda text: text.replace("{", '{"n": ' + "1" * 5000 + ",", 1), "not valid JSON"),
+        (lambda text: "[" * 100_000, "not valid JSON"),
     ],
 )
 def test_every_change_of_the_content_is_found(

@@ -442,6 +442,9 @@ def test_a_reader_without_rights_and_a_server_that_is_not_there_are_one_line(pos
         "postgresql://me:se@secret@127.0.0.1:1/x",
         "postgresql//me:secret@127.0.0.1/x",
         "me:secret@127.0.0.1/x",
+        "postgresql://me@127.0.0.1:1/x?password=p@secret",
+        "postgresql://me@127.0.0.1:1/x?PASSWORD=secret",
+        "postgresql://me:secret&q?password=x@127.0.0.1:1/x",
         "postgresql+pg8000://me:secret@127.0.0.1/x",
     ],
 )

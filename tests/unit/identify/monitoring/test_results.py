@@ -1,8 +1,10 @@
 """Announced results: what a listener that was away asks for, and deletion of old ones with their entries."""
 
 import datetime
+import errno
 import json
 import os
+import shutil
 import sqlite3
 import time
 from dataclasses import dataclass
@@ -168,6 +170,31 @@ def test_old_results_go_with_their_entries_when_their_recordings_have_gone(cell:
     os.unlink(cell.folder / "arm-b.mcap")
     prune_results(cell.ledger, 99.0)
     assert cell.known == [C, D, "e" * 64]
+
+
+def test_a_damaged_result_and_one_that_cannot_be_deleted_hold_up_no_other(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    damaged, refused, gone = (cell.finish(digest, recorded=False) for digest in (A, B, C))
+    cell.finish(D)
+    for digest in (A, B, C, D):
+        cell.announce(digest)
+    (damaged / "identification.json").write_text('{"of": "a')
+    answers = json.loads(results_since(cell.ledger, "2020-01-01"))["results"]
+    assert [each["document"] for each in answers] == [None, {"of": B}, {"of": C}, {"of": D}]
+    cell.now += 100 * DAY_S
+    rmtree = shutil.rmtree
+
+    def of_another_user(folder: Path) -> None:
+        if folder == refused:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(folder))
+        rmtree(folder)
+
+    monkeypatch.setattr(shutil, "rmtree", of_another_user)
+    with pytest.raises(PermissionError):
+        prune_results(cell.ledger, 99.0)
+    assert [folder.exists() for folder in (damaged, refused, gone)] == [False, True, False]
+    assert cell.known == [B, D]
 
 
 def test_the_newest_result_stays_however_old(cell: Cell) -> None:
