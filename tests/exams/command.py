@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tests.exams import emps, friction
+from tests.exams import emps, friction, kr300
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -17,6 +17,7 @@ class Exam(StrEnum):
 
     EMPS = "emps"
     FRICTION = "friction"
+    KR300 = "kr300"
 
 
 def exam(
@@ -25,7 +26,7 @@ def exam(
         Path | None,
         typer.Option(
             help="Folder of the recordings. For emps the parent of the folder emps, by default $ARMIDENT_SHARED_DATA "
-            "or ../shared/data; for friction a clone of the repository that the command names."
+            "or ../shared/data; for the others a clone of the repository that the command names."
         ),
     ] = None,
 ) -> None:
@@ -37,4 +38,4 @@ def exam(
         shared = Path(os.environ.get("ARMIDENT_SHARED_DATA") or REPOSITORY.parent / "shared" / "data")
         print(emps.report(data or shared))
     else:
-        print(friction.report(data))
+        print((friction if name is Exam.FRICTION else kr300).report(data))
