@@ -3,11 +3,11 @@
 Robot identification benchmark (Weigand, Götz, Ulmen, Ruskowski 2022): motor torques in N m and positions in degrees,
 sampled at 250 Hz, filtered by its authors at 4 Hz and kept at 10 Hz. Each recording has three motions, each twice, from
 and to the same pose. A public program ships it in pieces of 606 samples, each without its first position and its last
-torque. Regressors are computed at 100 Hz and filtered as the torques, because friction changes its sign within a sample.
+torque. Regressors are computed at 100 Hz and filtered as the torques: friction changes its sign within a sample.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -52,28 +52,26 @@ def over_speed(_: Floats, qd: Floats, __: Floats) -> list[Floats]:
 
 
 def presliding(q: Floats, _: Floats, __: Floats) -> list[Floats]:
-    """Return dry friction that builds up over four displacements, rad, and stays at standstill."""
-    return [dahl(q, displacement) for displacement in (1e-5, 1e-4, 1e-3, 1e-2)]
+    """Return dry friction that builds up over ten displacements, rad, and stays at standstill."""
+    return [dahl(q, displacement) for displacement in np.geomspace(1e-6, 3e-2, 10)]
 
 
 def stribeck(q: Floats, qd: Floats, _: Floats) -> list[Floats]:
-    """Return friction that falls with the speed, at three speeds, rad/s, and two displacements, rad."""
-    return [
-        dahl(q, displacement) * np.exp(-np.abs(qd) / v) for displacement in (1e-5, 1e-4) for v in (0.001, 0.01, 0.1)
-    ]
+    """Return friction that falls with the speed: four displacements, rad, at four speeds, rad/s."""
+    falling = [np.exp(-np.abs(qd) / v) for v in (3e-4, 3e-3, 3e-2, 3e-1)]
+    return [dahl(q, displacement) * share for displacement in (1e-5, 1e-4, 1e-3, 1e-2) for share in falling]
 
 
 def drift(_: Floats, qd: Floats, t: Floats) -> list[Floats]:
-    """Return friction that changes linearly with the time of the recordings."""
+    """Return viscous friction that changes linearly with the time of the recordings."""
     return [qd * np.abs(qd) * t, np.arcsinh(qd / 0.03) * t]
 
 
-Law = Callable[[Floats, Floats, Floats], list[Floats]]
-LAWS: dict[str, Law] = {
-    "curved over the speed": over_speed,
+LAWS: dict[str, Callable[[Floats, Floats, Floats], list[Floats]]] = {
+    "friction curved over the speed": over_speed,
     "presliding": presliding,
-    "Stribeck": stribeck,
-    "drift": drift,
+    "Stribeck friction": stribeck,
+    "friction drift": drift,
 }
 
 
@@ -84,6 +82,7 @@ class Record:
     position: Floats
     torque: Floats
     number: int
+    ends: tuple[int, int] = ENDS
 
     @cached_property
     def motion(self) -> tuple[Floats, Floats, Floats]:
@@ -98,7 +97,7 @@ class Record:
     def rows(self) -> NDArray[np.bool_]:
         """Mask (N,) of the samples that are fitted and judged."""
         rows: NDArray[np.bool_] = np.isfinite(self.torque[:, 0])
-        rows[: ENDS[0]] = rows[len(rows) - ENDS[1] :] = False
+        rows[: self.ends[0]] = rows[len(rows) - self.ends[1] :] = False
         return rows
 
     @cached_property
@@ -142,7 +141,7 @@ class Record:
         """Return the torques (M, 6) of a model, N m."""
         return np.column_stack([self.columns(laws, axis) @ theta for axis in range(RATIOS.size)])
 
-    @cached_property
+    @property
     def linear(self) -> Floats:
         """Positions, velocities and accelerations at the judged samples (M, 18)."""
         return np.hstack([signal[::FINER][self.rows] for signal in self.motion])
@@ -219,7 +218,7 @@ def load(clone: Path | None) -> list[Record]:
 
 
 def at_rest(records: Sequence[Record]) -> str:
-    """Return the range of 98 % of the torques of axes 2 and 3 while the arm rests in the pose in which recordings begin."""
+    """Return the range of 98 % of the torques of axes 2 and 3 while the arm rests in its first pose."""
     torques = []
     for record in records:
         q, qd, _ = (np.abs(signal[::FINER][record.rows]).max(axis=1) for signal in record.motion)
@@ -236,19 +235,22 @@ def report(clone: Path | None) -> str:
     *training, test = load(clone)
     x, y = (np.concatenate([getattr(record, name) for record in training]) for name in ("linear", "measured"))
     baseline = test.linear @ np.linalg.lstsq(x, y, rcond=None)[0]
+    theta, laws = np.zeros(0), list[str]()
     rows = [["linear in q, qd and qdd, as the benchmark's baseline", "", *figures(test, baseline)]]
-    laws: list[str] = []
     for name in ("rigid arm, viscous and Coulomb friction", *LAWS):
         laws += [name] if name in LAWS else []
         last = training[-1]
         left_out = percent(last.measured - last.predicted(laws, fitted(training[:-1], laws)), last.measured)
-        model = test.predicted(laws, fitted(training, laws))
-        rows.append([f"+ {name}" if laws else name, f"{left_out:.1f}", *figures(test, model)])
+        theta = fitted(training, laws)
+        rows.append([f"+ {name}" if laws else name, f"{left_out:.1f}", *figures(test, test.predicted(laws, theta))])
     heads = (
-        "model, torque error in %", "training recording 11, left out", "test", "axes 1 to 6", "fast", "slow", "standstill",
-        "share of standstill in the squared error", "mean NRMSE",
+        "model, torque error in %", "training, left out", "test", "axes 1 to 6", "fast", "slow", "standstill",
+        "standstill, share of squared error", "mean NRMSE",
     )  # fmt: skip
     repeated = ", ".join(f"{value:.1f}" for value in test.repeated())
+    whole = replace(test, ends=(0, 0))
+    error = percent(whole.measured - whole.predicted(laws, theta), whole.measured)
     return "\n\n".join([
-        table(heads, rows), f"repetition of the three motions: {repeated} %", at_rest([*training, test]),
+        table(heads, rows), f"the last model with both ends of the test recording: {error:.1f} %",
+        f"repetition of the three motions: {repeated} %", at_rest([*training, test]),
     ])  # fmt: skip
