@@ -134,8 +134,8 @@ class Record:
     def columns(self, laws: Sequence[str], axis: int) -> Floats:
         """Return the regressor (M, parameters) of the torque of one axis."""
         own = np.hstack([self.rigid[:, axis, :0], *(self.friction[law][:, axis] for law in laws)])
-        blocks = [own if j == axis else np.zeros_like(own) for j in range(RATIOS.size)]
-        return np.hstack([self.rigid[:, axis], *blocks])
+        others = [own if j == axis else np.zeros_like(own) for j in range(RATIOS.size)]
+        return np.hstack([self.rigid[:, axis], *others])
 
     def predicted(self, laws: Sequence[str], theta: Floats) -> Floats:
         """Return the torques (M, 6) of a model, N m."""
@@ -148,9 +148,8 @@ class Record:
 
     def repeated(self) -> list[float]:
         """Return the difference of each motion's torques from its repetition, over sqrt(2), percent of the torques."""
-        k = np.flatnonzero(self.rows)
+        k, found = np.flatnonzero(self.rows), []
         spline = make_interp_spline(k, self.measured, 3)
-        found = []
         for motion in range(PIECES // 2):
             instants = k[(k // PIECE == motion) & (k + REPEAT <= k[-1])]
             first, second = spline(instants), spline(instants + REPEAT)
@@ -165,8 +164,7 @@ def percent(error: Floats, signal: Floats) -> float:
 
 def fitted(records: Iterable[Record], laws: Sequence[str]) -> Floats:
     """Return the parameters of weighted least squares; an axis weighs as one over its residual's variance."""
-    axes = range(RATIOS.size)
-    products = []
+    axes, products = range(RATIOS.size), []
     for axis in axes:
         pairs = [(record.columns(laws, axis), record.measured[:, axis]) for record in records]
         products.append((
@@ -224,10 +222,8 @@ def at_rest(records: Sequence[Record]) -> str:
         q, qd, _ = (np.abs(signal[::FINER][record.rows]).max(axis=1) for signal in record.motion)
         torques.append(record.measured[(q < AT_START_RAD) & (qd < STILL)])
     resting = np.concatenate(torques)[:, 1:3]
-    low, high = np.quantile(resting, (0.01, 0.99), axis=0)
-    return f"at rest in one pose ({len(resting)} samples): axis 2 {low[0]:.1f} to {high[0]:.1f} N m, " + (
-        f"axis 3 {low[1]:.1f} to {high[1]:.1f} N m"
-    )
+    ranges = [f"{low:.1f} to {high:.1f} N m" for low, high in np.quantile(resting, (0.01, 0.99), axis=0).T]
+    return f"at rest in one pose ({len(resting)} samples): axes 2 and 3 {ranges[0]} and {ranges[1]}"
 
 
 def report(clone: Path | None) -> str:
@@ -235,11 +231,10 @@ def report(clone: Path | None) -> str:
     *training, test = load(clone)
     x, y = (np.concatenate([getattr(record, name) for record in training]) for name in ("linear", "measured"))
     baseline = test.linear @ np.linalg.lstsq(x, y, rcond=None)[0]
-    theta, laws = np.zeros(0), list[str]()
+    theta, laws, last = np.zeros(0), list[str](), training[-1]
     rows = [["linear in q, qd and qdd, as the benchmark's baseline", "", *figures(test, baseline)]]
     for name in ("rigid arm, viscous and Coulomb friction", *LAWS):
         laws += [name] if name in LAWS else []
-        last = training[-1]
         left_out = percent(last.measured - last.predicted(laws, fitted(training[:-1], laws)), last.measured)
         theta = fitted(training, laws)
         rows.append([f"+ {name}" if laws else name, f"{left_out:.1f}", *figures(test, test.predicted(laws, theta))])
