@@ -191,8 +191,8 @@ def figures(record: Record, predicted: Floats) -> list[str]:
     axes = " ".join(f"{percent(error[:, j], torque[:, j]):.1f}" for j in range(RATIOS.size))
     kind = np.digitize(record.speed, SPEEDS)
     parts = [f"{percent(error[kind == k], torque[kind == k]):.1f}" for k in (2, 1, 0)]
-    share = 100 * np.sum(error[kind == 0] ** 2) / np.sum(error**2)
-    nrmse = float(np.mean(np.sqrt(np.mean(error**2, axis=0)) / torque.std(axis=0)))
+    share = percent(error[kind == 0], error) ** 2 / 100
+    nrmse = np.mean(np.sqrt(np.mean(error**2, axis=0)) / torque.std(axis=0))
     return [f"{percent(error, torque):.1f}", axes, *parts, f"{share:.0f}", f"{nrmse:.3f}"]
 
 
@@ -200,8 +200,7 @@ def load(clone: Path | None) -> list[Record]:
     """Read the recordings, eleven for training and the last for the test. Raises ConfigError, with the place."""
     if clone is None:
         raise ConfigError(f"the recordings are in {REPOSITORY}: {WHERE}")
-    path = clone / FILE
-    if not is_file(path):
+    if not is_file(path := clone / FILE):
         raise ConfigError(f"{path} is missing: {WHERE}")
     try:
         read = loadmat(path)
