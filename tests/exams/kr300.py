@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
 
 from armident.configs import ConfigError, DataError, load_robot
 from armident.configs.yaml_loader import is_file
@@ -206,11 +207,10 @@ def load(clone: Path | None) -> list[Record]:
         read = loadmat(path)
         u, y = (np.hstack([read[f"{name}_{part}"] for part in ("train", "val", "test")]).T for name in "uy")
         u, y = (signal.reshape(-1, PIECES, PIECE - 1, RATIOS.size) for signal in (u, np.deg2rad(y)))
-    except (KeyError, ValueError, NotImplementedError) as error:
+    except (KeyError, ValueError, NotImplementedError, OSError, MatReadError) as error:
         raise DataError(f"{path} is not that file ({error}): {WHERE}") from error
-    hole = ((0, 0), (0, 0), (0, 1), (0, 0))
-    torque = np.pad(u, hole, constant_values=np.nan).reshape(len(u), -1, RATIOS.size)
-    position = np.pad(y[:, :, ::-1], hole, constant_values=np.nan)[:, :, ::-1].reshape(torque.shape)
+    hole = np.full((len(u), PIECES, 1, RATIOS.size), np.nan)
+    position, torque = (np.concatenate(parts, axis=2).reshape(len(u), -1, 6) for parts in ((hole, y), (u, hole)))
     return [Record(*signals, number) for number, signals in enumerate(zip(position, torque, strict=True))]
 
 
