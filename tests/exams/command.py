@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tests.exams import emps, friction, tx40, ur10e
+from tests.exams import emps, friction, kr300, tx40, ur10e
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -17,6 +17,7 @@ class Exam(StrEnum):
 
     EMPS = "emps"
     FRICTION = "friction"
+    KR300 = "kr300"
     TX40 = "tx40"
     UR10E = "ur10e"
 
@@ -27,7 +28,7 @@ def exam(
         Path | None,
         typer.Option(
             help="Folder of the recordings. For emps and tx40 the parent of the folder of that name, by default "
-            "$ARMIDENT_SHARED_DATA or ../shared/data; for friction and ur10e a clone of the repository that the "
+            "$ARMIDENT_SHARED_DATA or ../shared/data; for the others a clone of the repository that the "
             "command names."
         ),
     ] = None,
@@ -40,4 +41,5 @@ def exam(
         shared = Path(os.environ.get("ARMIDENT_SHARED_DATA") or REPOSITORY.parent / "shared" / "data")
         print((emps if name is Exam.EMPS else tx40).report(data or shared))
     else:
-        print((friction if name is Exam.FRICTION else ur10e).report(data))
+        of = {Exam.FRICTION: friction, Exam.KR300: kr300, Exam.UR10E: ur10e}
+        print(of[name].report(data))

@@ -5,15 +5,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.io import savemat
 from typer.testing import CliRunner
 
 from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
+from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import simulate
-from tests.exams import emps, friction, tx40, ur10e
+from armident.identify.signals.bandpass import butterworth
+from tests.exams import emps, friction, kr300, tx40, ur10e
 from tests.reproduction.recordings import EMPS_FILE, EMPS_PERIOD
 from tests.tools.command_line import NAME, laboratory
+
+Floats = NDArray[np.float64]
 
 KNOWN = {"mass": 95.0, "viscous_up": 200.0, "viscous_down": 200.0, "coulomb_up": 20.0, "coulomb_down": 20.0}
 SWITCHING = 1e7
@@ -27,6 +33,8 @@ SWITCHING = 1e7
         (["tx40", "--data", "{folder}"], "figaroh-examples"),
         (["friction", "--data", "{folder}"], friction.REPOSITORY),
         (["friction"], friction.REPOSITORY),
+        (["kr300", "--data", "{folder}"], kr300.REPOSITORY),
+        (["kr300"], kr300.REPOSITORY),
         (["ur10e", "--data", "{folder}"], ur10e.REPOSITORY),
         (["ur10e"], ur10e.REPOSITORY),
     ],
@@ -111,6 +119,44 @@ def test_the_forearm_follows_the_programmed_path_from_the_start_posture() -> Non
     assert np.ptp(moving) > 0.3
     record = replace(known_record(0.1, 0.0), forearm=np.zeros(10_000))
     assert record.rigid.shape == (10_000, 8)
+
+
+def known_recording(seed: int, model: ArmModel, theta: Floats) -> tuple[Floats, Floats]:
+    """Positions, degrees, and motor torques, N m, (3636, 6), of a known arm, filtered and sampled as the benchmark."""
+    rng = np.random.default_rng(seed)
+    n, dt = kr300.PIECE * kr300.PIECES, kr300.PERIOD / kr300.FINER
+    t = np.arange(n * kr300.FINER) * dt
+    envelope = np.sin(np.pi * t / (kr300.PIECE * kr300.PERIOD)) ** 4
+    rates = rng.uniform(0.2, 0.8, (3, 6))
+    q = envelope[:, None] * sum(0.2 * np.sin(np.outer(t, rate) + rng.uniform(0, 6, 6)) for rate in rates)
+    qd = np.gradient(q, dt, axis=0)
+    tau = model.inverse_dynamics(theta, q, qd, np.gradient(qd, dt, axis=0))
+    sampled = (butterworth(x, dt, kr300.FILTER_HZ)[:: kr300.FINER] for x in (np.rad2deg(q), tau / kr300.RATIOS))
+    position, torque = sampled
+    return position, torque
+
+
+@pytest.mark.slow
+def test_the_torques_of_a_known_arm_are_predicted_from_another_recording_in_pieces(tmp_path: Path) -> None:
+    model = ArmModel.from_config(load_robot(kr300.ROBOT))
+    theta = np.random.default_rng(0).uniform(50.0, 200.0, model.base.b)
+    recordings = [known_recording(seed, model, theta) for seed in (1, 2)]
+    contents: dict[str, Floats] = {"u_val": np.zeros((6, 0)), "y_val": np.zeros((6, 0))}
+    for part, (y, u) in zip(("train", "test"), recordings, strict=True):
+        torque, position = (x.reshape(kr300.PIECES, kr300.PIECE, 6) for x in (u, y))
+        contents[f"u_{part}"] = torque[:, :-1].reshape(-1, 6).T
+        contents[f"y_{part}"] = position[:, 1:].reshape(-1, 6).T
+    (tmp_path / kr300.FILE).parent.mkdir(parents=True)
+    savemat(tmp_path / kr300.FILE, contents)
+    training, test = kr300.load(tmp_path)
+    known = np.isfinite(training.position)
+    np.testing.assert_allclose(training.position[known], np.deg2rad(recordings[0][0])[known])
+    np.testing.assert_allclose(training.torque[training.rows], recordings[0][1][training.rows])
+    found = kr300.fitted([training], [])
+    error = kr300.percent(test.measured - test.predicted([], found), test.measured)
+    late = replace(test, torque=np.roll(test.torque, 1, axis=0))
+    assert error < 0.2
+    assert kr300.percent(late.measured - late.predicted([], found), late.measured) > 5 * error
 
 
 @pytest.mark.slow
