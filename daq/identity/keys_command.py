@@ -58,6 +58,7 @@ def keys(
     from armident.daq.identity import OF_PLANT, VARIABLE
     from armident.daq.identity import plant as of_plant
     from armident.daq.identity.access import ROUTER_FILE
+    from armident.daq.identity.certificates import REVOKED
     from armident.daq.identity.folder import key_folder
 
     addresses, now = address or [], datetime.now(UTC)
@@ -93,7 +94,8 @@ def keys(
         made.append(of_plant.renew(path, str(subject), addresses, days))
     elif action == "revoke":
         of_plant.revoke(path, str(subject))
-        print(f"{subject}: revoked once the router has started again with {path / ROUTER_FILE}")
+        print(f"{subject}: revoked once the router has started again with {path / ROUTER_FILE},")
+        print(f"  and {path / REVOKED} is beside authority.pem on the hosts of pages, OPC UA servers and cells")
     elif action == "router":
         of_plant.write_router(path)
         print(path / ROUTER_FILE)

@@ -20,7 +20,9 @@ from armident.configs.reasons import reason_of
 from armident.daq.identity.access import ROUTER_FILE, explained, host_of, is_loopback, router_file, router_name
 from armident.daq.identity.certificates import (
     ANY_CELL,
+    REVOKED,
     ROLES,
+    Authority,
     Identity,
     Role,
     identity_of,
@@ -103,6 +105,7 @@ def make_authority(folder: Path, plant: str) -> None:
     authority = new_authority(plant, AUTHORITY_DAYS)
     write_key(folder / "authority.key", authority.key)
     write_whole(folder / "authority.pem", pem_of(authority.certificate), 0o644)
+    _write_revoked(folder, authority)
 
 
 def plant_of(folder: Path) -> str:
@@ -150,6 +153,9 @@ def enrol(folder: Path, role: str, cell: str | None, name: str | None, addresses
 def renew(folder: Path, name: str, addresses: Sequence[str], days: int) -> Identity:
     """Replace certificate and key of a name; role and cell stay, and the addresses unless others are given."""
     old = _known(folder, name)
+    # Former ones stay valid, too: a revocation needs them.
+    former = [each for each in _former(folder, name) if days_left(each, datetime.now(UTC)) >= 0]
+    write_whole(_former_file(folder, name), pem_of(old.certificate, *former), 0o644)
     return _issue(folder, old.role, old.cell, name, addresses or old.addresses, days)
 
 
@@ -161,14 +167,16 @@ def renew_authority(folder: Path) -> None:
     # In this order an interrupted renewal leaves the former key, which is still trusted.
     write_whole(folder / "authority.pem", pem_of(new.certificate, *old), 0o644)
     write_key(folder / "authority.key", new.key)
+    _write_revoked(folder, new)
 
 
 def revoke(folder: Path, name: str) -> None:
-    """Remove a name from the access control of the router, and keep it from being enrolled again."""
-    read_authority(folder)
-    _known(folder, name)
-    (folder / f"{name}.pem").rename(_revoked(folder, name))
-    (folder / f"{name}.key").unlink(missing_ok=True)
+    """Remove a name from the access control, add its certificates to the revocation list, and never enrol it again."""
+    authority, own = read_authority(folder), _known(folder, name)
+    write_whole(_revoked(folder, name), pem_of(own.certificate, *_former(folder, name)), 0o644)
+    _write_revoked(folder, authority)
+    for path in (folder / f"{name}.pem", folder / f"{name}.key", _former_file(folder, name)):
+        path.unlink(missing_ok=True)
     write_router(folder)
 
 
@@ -336,6 +344,20 @@ def _router_text(folder: Path) -> str:
 
 def _revoked(folder: Path, name: str) -> Path:
     return folder / f"{name}.pem.revoked"
+
+
+def _write_revoked(folder: Path, authority: Authority) -> None:
+    revoked = [each for path in sorted(folder.glob("*.pem.revoked")) for each in read_certificates(path)]
+    write_whole(folder / REVOKED, authority.revocation_list(revoked), 0o644)
+
+
+def _former_file(folder: Path, name: str) -> Path:
+    return folder / f"{name}.pem.former"
+
+
+def _former(folder: Path, name: str) -> tuple[x509.Certificate, ...]:
+    path = _former_file(folder, name)
+    return read_certificates(path) if path.exists() else ()
 
 
 def _check_name(name: str, option: str) -> str:

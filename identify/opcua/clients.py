@@ -4,6 +4,7 @@ import asyncio
 import logging
 import secrets
 import socket
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -17,7 +18,7 @@ from asyncua.server.internal_session import InternalSession
 from asyncua.server.user_managers import UserManager
 
 from armident.configs import ConfigError, DataError
-from armident.daq.identity.certificates import signer_of
+from armident.daq.identity.certificates import identity_of
 from armident.daq.identity.folder import KeyFolder
 from armident.daq.streaming import Refusals
 
@@ -31,20 +32,30 @@ LARGEST, SMALLEST_BUFFER = 1 << 20, 8192
 """Largest message, and smallest buffer of a client (OPC 10000-6, 7.1.2.3), bytes."""
 
 
+@dataclass
+class _User(User):
+    """User, with the certificate (DER) by which he signed in; on loopback perhaps none."""
+
+    certificate: bytes | None = None
+
+
 class Clients(UserManager):
     """Those who may sign in: on loopback anybody; with the keys of a plant, holders of a certificate of ``opcua``."""
 
     def __init__(self, folder: KeyFolder | None) -> None:
         self.folder, self._refusals = folder, Refusals(log)
 
-    def check(self, certificate: bytes | None) -> None:
-        """Raise ServiceError unless a certificate (DER) is one of the plant for OPC UA, and valid now."""
-        if self.folder is None:
-            return
-        try:
-            role, _, name = signer_of(certificate or b"", self.folder.authority_certificates(), datetime.now(UTC))
+    def require(self, certificate: bytes | None) -> None:
+        """Raise DataError unless a certificate (DER) is one of the plant for OPC UA, not revoked, and valid now."""
+        if self.folder is not None:
+            role, _, name = identity_of(self.folder.trusted(certificate or b"", datetime.now(UTC)))
             if role != "opcua":
                 raise DataError(f"{name}: a certificate of the role {role}, not of opcua")
+
+    def check(self, certificate: bytes | None) -> None:
+        """Raise ServiceError, and report it, unless `require` takes a certificate."""
+        try:
+            self.require(certificate)
         except (DataError, ConfigError) as error:
             self._refusals.refuse("client", f"a client is refused: {error}")
             raise ServiceError(ua.StatusCodes.BadCertificateUntrusted) from error
@@ -54,11 +65,13 @@ class Clients(UserManager):
     ) -> User:
         """Return the user of a session; with the keys of a plant, the user has signed with ``certificate``."""
         self.check(certificate)
-        return User(UserRole.User)
+        return _User(UserRole.User, certificate=certificate)
 
 
 class _Session(InternalSession):
     """Session that only reads. Nobody guesses its token, and it takes nothing that belongs to another one."""
+
+    user: _User
 
     def __init__(self, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)
@@ -173,6 +186,21 @@ class LimitedServer(Server):
     def __init__(self, clients: Clients, listening: socket.socket) -> None:
         super().__init__(_Sessions(clients))
         self._listening, self.limits = listening, _Limits(1 << 16, 1 << 16, 32, LARGEST)
+
+    def sign_out(self) -> None:
+        """End the connections of clients whose certificate has been revoked or has ended."""
+        for each in tuple(self.bserver.clients):
+            session = each.processor and each.processor.session
+            if isinstance(session, _Session) and session.is_activated() and each.transport is not None:
+                try:
+                    for certificate in (session._peer, session.user.certificate):
+                        self.iserver.user_manager.require(certificate)
+                except DataError as error:
+                    log.warning("a client is signed out: %s", error)
+                    each.transport.abort()
+                except ConfigError as error:
+                    # While a file is replaced, those who have signed in stay.
+                    log.debug("%s", error)
 
     async def start(self) -> None:
         """Begin to serve."""

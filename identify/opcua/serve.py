@@ -76,6 +76,7 @@ async def _serve(
             print(f"opcua: {url} ({number})", flush=True)
             notifier.ready(f"{number} at {url}")
             while not stopped.is_set():
+                server.sign_out()
                 for name in plant.cells:
                     await nodes.update(plant.view(name))
                 if read.is_set():

@@ -5,14 +5,18 @@ import signal
 import ssl
 from collections.abc import Sequence
 from contextlib import closing
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import uvicorn
 from cryptography import x509
+from starlette.responses import PlainTextResponse
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from armident.configs import ConfigError
+from armident.configs import ConfigError, DataError
 from armident.daq.identity.certificates import ANY_CELL
 from armident.daq.identity.folder import KeyFolder, key_folder
 from armident.identify.page.addresses import address_of, bound, is_loopback
@@ -80,7 +84,25 @@ def sign_in(folder: KeyFolder, listen: str) -> tuple[Sequence[str], dict[str, An
         f"ssl_{kind}file": folder.path / f"{identity.name}.{end}" for kind, end in (("cert", "pem"), ("key", "key"))
     }
     authority = folder.path / "authority.pem"
-    return hosts, files | {"ssl_ca_certs": authority, "ssl_cert_reqs": ssl.CERT_REQUIRED}
+    tls = {"ssl_ca_certs": authority, "ssl_cert_reqs": ssl.CERT_REQUIRED}
+    return hosts, files | tls | {"http": partial(_Connection, folder)}
+
+
+class _Connection(H11Protocol):
+    """Connection of a browser, whose certificate must count at each request: it is revoked or ends meanwhile."""
+
+    def __init__(self, folder: KeyFolder, **options: Any) -> None:
+        super().__init__(**options)
+        self._folder = folder
+
+    def data_received(self, data: bytes) -> None:
+        certificate = self.transport.get_extra_info("ssl_object").getpeercert(binary_form=True)
+        try:
+            self._folder.trusted(certificate, datetime.now(UTC))
+        except (DataError, ConfigError) as error:
+            log.warning("a browser is refused: %s", error)
+            self.app = PlainTextResponse(f"{error}\nAsk for a new one where the authority is.\n", 403)
+        super().data_received(data)
 
 
 def _ended(_number: int, _frame: FrameType | None) -> None:

@@ -11,19 +11,21 @@ import pytest
 import zenoh
 from typer.testing import CliRunner
 
-from armident.configs import ConfigError
+from armident.configs import ConfigError, DataError
 from armident.daq.cli import application
 from armident.daq.identity.certificates import (
+    identity_of,
     new_authority,
     pem_of,
     read_authority,
     read_certificates,
     read_identity,
-    signer_of,
+    trusted_certificate,
     write_identity,
     write_key,
     write_whole,
 )
+from armident.daq.identity.folder import KeyFolder
 from armident.daq.identity.plant import (
     Countdown,
     certificate_ends,
@@ -273,7 +275,7 @@ def test_a_renewed_authority_still_trusts_the_former_one(plant: Path) -> None:
     trusted = read_certificates(plant / "authority.pem")
     assert [len(trusted), problems(plant)] == [2, []]
     for identity in (old, new):
-        assert signer_of(der(identity), trusted, now())[2] == "capture.press_7"
+        assert identity_of(trusted_certificate(der(identity), trusted, now()))[2] == "capture.press_7"
     assert read_authority(plant).certificate == trusted[0]
 
 
@@ -284,6 +286,35 @@ def test_a_revoked_name_has_no_access_and_is_not_given_again(plant: Path) -> Non
     assert problems(plant) == []
     with pytest.raises(ConfigError, match=r"viewer\.anna was revoked; choose another --name"):
         enrol(plant, "viewer", "press_7", "anna", [], 365)
+
+
+def test_all_certificates_of_a_revoked_name_are_refused_and_no_others(plant: Path) -> None:
+    """Those before a renewal, and of a former authority, are valid until they end: a thief may have one of them."""
+    stolen, other = read_identity(plant / "viewer.anna.pem"), read_identity(plant / "capture.press_7.pem")
+    stolen_later = renew(plant, "viewer.anna", (), 30)
+    folder = KeyFolder(plant)
+    assert not folder.revoked()
+    assert run("renew", "authority", "--folder", plant)[0] == 0
+    stolen_last = renew(plant, "viewer.anna", (), 30)
+    code, said, _ = run("revoke", "viewer.anna", "--folder", plant)
+    assert (code, "authority.crl is beside authority.pem" in said) == (0, True)
+    for identity in (stolen, stolen_later, stolen_last):
+        with pytest.raises(DataError, match=r"viewer\.anna: the certificate was revoked"):
+            folder.trusted(der(identity), now())
+    assert identity_of(folder.trusted(der(other), now()))[2] == "capture.press_7"
+    # The list of the next authority has them, too.
+    assert run("renew", "authority", "--folder", plant)[0] == 0
+    with pytest.raises(DataError, match="was revoked"):
+        folder.trusted(der(stolen), now())
+
+
+@pytest.mark.parametrize("damage", ["foreign", "cut", "empty"])
+def test_nobody_is_trusted_with_a_revocation_list_that_is_none_of_the_plant(plant: Path, damage: str) -> None:
+    path, anna = plant / "authority.crl", read_identity(plant / "viewer.anna.pem")
+    foreign = new_authority("werk", 30).revocation_list([])
+    path.write_bytes({"foreign": foreign, "cut": path.read_bytes()[:-40], "empty": b""}[damage])
+    with pytest.raises(ConfigError, match=r"authority\.crl: .*copy it again"):
+        KeyFolder(plant).trusted(der(anna), now())
 
 
 def test_a_certificate_does_not_outlive_its_authority(plant: Path) -> None:
