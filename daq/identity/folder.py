@@ -82,19 +82,18 @@ class KeyFolder:
 
     def revoked(self) -> frozenset[int]:
         """Return the serial numbers in the revocation list, if there is one; ConfigError if it is none of the plant."""
-        path = self.path / REVOKED
-        if not is_file(path):
-            return frozenset()
         try:
-            found = x509.load_pem_x509_crl(path.read_bytes())
-            keys = [each.public_key() for each in self.authority_certificates()]
-            if any(isinstance(key, ec.EllipticCurvePublicKey) and found.is_signature_valid(key) for key in keys):
-                return frozenset(each.serial_number for each in found)
+            data = (self.path / REVOKED).read_bytes()
+        except FileNotFoundError:
+            return frozenset()
         except OSError as error:
             raise ConfigError(reason_of(error)) from error
-        except ValueError as error:
-            raise ConfigError(f"{path}: expected a revocation list (PEM); copy it again") from error
-        raise ConfigError(f"{path}: not the revocation list of this authority; copy it again")
+        keys = (each.public_key() for each in self.authority_certificates())
+        with suppress(ValueError):
+            found = x509.load_pem_x509_crl(data)
+            if any(found.is_signature_valid(key) for key in keys if isinstance(key, ec.EllipticCurvePublicKey)):
+                return frozenset(each.serial_number for each in found)
+        raise ConfigError(f"{self.path / REVOKED}: not the revocation list of the authority; copy it again")
 
     def trusted(self, certificate_der: bytes, at: datetime) -> x509.Certificate:
         """Return a certificate of the plant that is valid at a time and not revoked; DataError, ConfigError if none."""

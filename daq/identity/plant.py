@@ -153,9 +153,8 @@ def enrol(folder: Path, role: str, cell: str | None, name: str | None, addresses
 def renew(folder: Path, name: str, addresses: Sequence[str], days: int) -> Identity:
     """Replace certificate and key of a name; role and cell stay, and the addresses unless others are given."""
     old = _known(folder, name)
-    # Former ones stay valid, too: a revocation needs them.
-    former = [each for each in _former(folder, name) if days_left(each, datetime.now(UTC)) >= 0]
-    write_whole(_former_file(folder, name), pem_of(old.certificate, *former), 0o644)
+    # A former certificate is valid until it ends: a revocation needs it.
+    write_whole(folder / f"{name}.pem.former", pem_of(old.certificate, *_former(folder, name)), 0o644)
     return _issue(folder, old.role, old.cell, name, addresses or old.addresses, days)
 
 
@@ -175,8 +174,8 @@ def revoke(folder: Path, name: str) -> None:
     authority, own = read_authority(folder), _known(folder, name)
     write_whole(_revoked(folder, name), pem_of(own.certificate, *_former(folder, name)), 0o644)
     _write_revoked(folder, authority)
-    for path in (folder / f"{name}.pem", folder / f"{name}.key", _former_file(folder, name)):
-        path.unlink(missing_ok=True)
+    for end in ("pem", "key", "pem.former"):
+        (folder / f"{name}.{end}").unlink(missing_ok=True)
     write_router(folder)
 
 
@@ -351,12 +350,8 @@ def _write_revoked(folder: Path, authority: Authority) -> None:
     write_whole(folder / REVOKED, authority.revocation_list(revoked), 0o644)
 
 
-def _former_file(folder: Path, name: str) -> Path:
-    return folder / f"{name}.pem.former"
-
-
 def _former(folder: Path, name: str) -> tuple[x509.Certificate, ...]:
-    path = _former_file(folder, name)
+    path = folder / f"{name}.pem.former"
     return read_certificates(path) if path.exists() else ()
 
 

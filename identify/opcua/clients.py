@@ -45,17 +45,14 @@ class Clients(UserManager):
     def __init__(self, folder: KeyFolder | None) -> None:
         self.folder, self._refusals = folder, Refusals(log)
 
-    def require(self, certificate: bytes | None) -> None:
-        """Raise DataError unless a certificate (DER) is one of the plant for OPC UA, not revoked, and valid now."""
-        if self.folder is not None:
+    def check(self, certificate: bytes | None) -> None:
+        """Raise ServiceError unless a certificate (DER) is one of the plant for OPC UA, not revoked, and valid now."""
+        if self.folder is None:
+            return
+        try:
             role, _, name = identity_of(self.folder.trusted(certificate or b"", datetime.now(UTC)))
             if role != "opcua":
                 raise DataError(f"{name}: a certificate of the role {role}, not of opcua")
-
-    def check(self, certificate: bytes | None) -> None:
-        """Raise ServiceError, and report it, unless `require` takes a certificate."""
-        try:
-            self.require(certificate)
         except (DataError, ConfigError) as error:
             self._refusals.refuse("client", f"a client is refused: {error}")
             raise ServiceError(ua.StatusCodes.BadCertificateUntrusted) from error
@@ -70,8 +67,6 @@ class Clients(UserManager):
 
 class _Session(InternalSession):
     """Session that only reads. Nobody guesses its token, and it takes nothing that belongs to another one."""
-
-    user: _User
 
     def __init__(self, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)
@@ -190,17 +185,13 @@ class LimitedServer(Server):
     def sign_out(self) -> None:
         """End the connections of clients whose certificate has been revoked or has ended."""
         for each in tuple(self.bserver.clients):
-            session = each.processor and each.processor.session
-            if isinstance(session, _Session) and session.is_activated() and each.transport is not None:
+            session: Any = each.processor and each.processor.session
+            if session and session.is_activated():
                 try:
                     for certificate in (session._peer, session.user.certificate):
-                        self.iserver.user_manager.require(certificate)
-                except DataError as error:
-                    log.warning("a client is signed out: %s", error)
+                        self.iserver.user_manager.check(certificate)
+                except ServiceError:
                     each.transport.abort()
-                except ConfigError as error:
-                    # While a file is replaced, those who have signed in stay.
-                    log.debug("%s", error)
 
     async def start(self) -> None:
         """Begin to serve."""

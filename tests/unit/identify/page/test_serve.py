@@ -19,6 +19,7 @@ from armident.daq.cli import application
 from armident.daq.identity.certificates import (
     ANY_CELL,
     Authority,
+    Role,
     new_authority,
     pem_of,
     read_certificates,
@@ -170,3 +171,8 @@ def test_other_machines_sign_in_with_a_certificate_of_the_plant(folder: Path, tm
             answer = kept.getresponse()
             assert (answer.status, b"viewer.otto: the certificate was revoked" in answer.read()) == (403, True)
         assert [asked(otto), asked(anna)] == [403, 200]
+        # The page shows all cells; another role reads none of them.
+        others: tuple[tuple[Role, str], ...] = (("viewer", "press_2"), ("opcua", ANY_CELL), ("capture", "press_2"))
+        for role, cell in others:
+            write_identity(tmp_path, authority.issue(role, cell, f"{role}.x", (), 30))
+            assert asked(tmp_path / f"{role}.x") == 403
