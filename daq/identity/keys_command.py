@@ -89,13 +89,13 @@ def keys(
     elif action == "renew" and subject == of_plant.AUTHORITY:
         of_plant.renew_authority(path)
         print(f"{path / 'authority.pem'}: new authority; the former ones stay trusted until they end")
-        print("first copy it to all hosts and restart the router, then: armident keys renew --all")
+        print(f"first copy it and {REVOKED} to all hosts and restart the router, then: armident keys renew --all")
     elif action == "renew":
         made.append(of_plant.renew(path, str(subject), addresses, days))
     elif action == "revoke":
         of_plant.revoke(path, str(subject))
         print(f"{subject}: revoked once the router has started again with {path / ROUTER_FILE},")
-        print(f"  and {path / REVOKED} is beside authority.pem on the hosts of pages, OPC UA servers and cells")
+        print(f"  and elsewhere once {path / REVOKED} is in the folder of keys of the host")
     elif action == "router":
         of_plant.write_router(path)
         print(path / ROUTER_FILE)
@@ -111,7 +111,7 @@ def keys(
     else:
         raise ConfigError(f"no action {action!r}; expected init, enrol, show, check, renew, revoke or router")
     for each in made:
-        files = f"{path}/{each.name}.pem, {each.name}.key and authority.pem"
+        files = f"{path}/{each.name}.pem, {each.name}.key, authority.pem and {REVOKED}"
         print(f"{each.name}: valid until {each.certificate.not_valid_after_utc:%Y-%m-%d}")
         print(f"  copy {files} to {OF_PLANT} on its host")
     if action == "enrol":

@@ -105,7 +105,6 @@ def make_authority(folder: Path, plant: str) -> None:
     authority = new_authority(plant, AUTHORITY_DAYS)
     write_key(folder / "authority.key", authority.key)
     write_whole(folder / "authority.pem", pem_of(authority.certificate), 0o644)
-    _write_revoked(folder, authority)
 
 
 def plant_of(folder: Path) -> str:
@@ -311,6 +310,7 @@ def _issue(folder: Path, role: Role, cell: str, name: str, addresses: Sequence[s
         raise ConfigError(f"the authority in {folder} has expired; run: armident keys renew {AUTHORITY}")
     identity = authority.issue(role, cell, name, addresses, days)
     write_identity(folder, identity)
+    _write_revoked(folder, authority)
     write_router(folder)
     return identity
 
