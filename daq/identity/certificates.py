@@ -2,7 +2,7 @@
 
 import os
 import secrets
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -28,6 +28,8 @@ TOLERANCE = timedelta(minutes=5)
 """Difference of the clocks of two hosts that a new certificate allows for."""
 APPLICATION = "urn:"
 """Begin of an address that is the URI of an application of OPC UA."""
+REVOKED = "authority.crl"
+"""Name of the revocation list beside ``authority.pem``."""
 RSA_BITS = 3072
 """Length of an RSA key, as strong as the curve P-256 (NIST SP 800-57)."""
 
@@ -88,6 +90,18 @@ class Authority:
         builder = _builder(subject, key, days, now, None, more).issuer_name(self.certificate.subject)
         return Identity(role, cell, name, key, builder.sign(self.key, SHA256()))
 
+    def revocation_list(self, revoked: Iterable[x509.Certificate]) -> bytes:
+        """Return the list of revoked certificates as PEM (RFC 5280, section 5), valid as long as the authority."""
+        now = datetime.now(UTC)
+        builder = (
+            x509.CertificateRevocationListBuilder(self.certificate.subject, now, self.certificate.not_valid_after_utc)
+            .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key()), False)
+            .add_extension(x509.CRLNumber(int(now.timestamp())), False)
+        )
+        for each in revoked:
+            builder = builder.add_revoked_certificate(x509.RevokedCertificateBuilder(each.serial_number, now).build())
+        return builder.sign(self.key, SHA256()).public_bytes(Encoding.PEM)
+
 
 def new_authority(plant: str, days: int, now: datetime | None = None) -> Authority:
     """Return a new authority of a plant; its certificate signs itself, and no other authority."""
@@ -109,20 +123,17 @@ def identity_of(certificate: x509.Certificate) -> tuple[Role, str, str]:
     return role, cell, name
 
 
-def signer_of(
-    certificate_der: bytes, authority_certificates: Iterable[x509.Certificate], at: datetime
-) -> tuple[Role, str, str]:
-    """Return role, cell and name of a certificate that one of the authorities has issued and that is valid at a time.
-
-    DataError if it is of another authority, expired, not yet valid, or without a role.
-    """
-    return identity_of(trusted_certificate(certificate_der, authority_certificates, at))
-
-
 def trusted_certificate(
-    certificate_der: bytes, authority_certificates: Iterable[x509.Certificate], at: datetime
+    certificate_der: bytes,
+    authority_certificates: Iterable[x509.Certificate],
+    at: datetime,
+    revoked: Container[int] = (),
 ) -> x509.Certificate:
-    """Return a certificate from its bytes, checked as by `signer_of`."""
+    """Return the certificate of these bytes, that one of the authorities has issued and that is valid at a time.
+
+    ``revoked``: serial numbers. DataError if it is of another authority, revoked, expired, not yet valid, or without a
+    role.
+    """
     try:
         certificate = x509.load_der_x509_certificate(certificate_der)
     except (ValueError, TypeError, UnsupportedAlgorithm, x509.InvalidVersion) as error:
@@ -136,6 +147,8 @@ def trusted_certificate(
         raise DataError(f"{name!r}: its certificate was issued by another authority")
     if not isinstance(certificate.public_key(), _KEYS[identity_of(certificate)[0] == "opcua"]):
         raise DataError(f"{name}: the certificate has another kind of key than its role")
+    if certificate.serial_number in revoked:
+        raise DataError(f"{name}: the certificate was revoked")
     check_dates(certificate, at, name)
     check_dates(authority, at, "the authority")
     return certificate

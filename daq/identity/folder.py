@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from armident.configs import ConfigError
 from armident.configs.reasons import reason_of
@@ -17,6 +18,7 @@ from armident.configs.yaml_loader import is_file
 from armident.daq.identity import OF_PLANT, VARIABLE
 from armident.daq.identity.certificates import (
     ANY_CELL,
+    REVOKED,
     Identity,
     Role,
     new_authority,
@@ -24,6 +26,7 @@ from armident.daq.identity.certificates import (
     read_authority,
     read_certificates,
     read_identity,
+    trusted_certificate,
     write_identity,
     write_key,
     write_whole,
@@ -77,12 +80,32 @@ class KeyFolder:
             raise ConfigError(f"{path}: no such file; copy it from the machine on which armident keys init ran")
         return read_certificates(path)
 
-    def stamp(self, name: str) -> tuple[int, ...]:
-        """Return the times of change of the folder and of a file in it, by which a renewal is noticed."""
-        found = [0, 0]
-        with suppress(OSError):
-            found[0] = self.path.stat().st_mtime_ns
-            found[1] = (self.path / name).stat().st_mtime_ns
+    def revoked(self) -> frozenset[int]:
+        """Return the serial numbers in the revocation list, if there is one; ConfigError if it is none of the plant."""
+        try:
+            data = (self.path / REVOKED).read_bytes()
+        except FileNotFoundError:
+            return frozenset()
+        except OSError as error:
+            raise ConfigError(reason_of(error)) from error
+        keys = (each.public_key() for each in self.authority_certificates())
+        with suppress(ValueError):
+            found = x509.load_pem_x509_crl(data)
+            if any(found.is_signature_valid(key) for key in keys if isinstance(key, ec.EllipticCurvePublicKey)):
+                return frozenset(each.serial_number for each in found)
+        raise ConfigError(f"{self.path / REVOKED}: not the revocation list of the authority; copy it again")
+
+    def trusted(self, certificate_der: bytes, at: datetime) -> x509.Certificate:
+        """Return a certificate of the plant that is valid at a time and not revoked; DataError, ConfigError if none."""
+        return trusted_certificate(certificate_der, self.authority_certificates(), at, self.revoked())
+
+    def stamp(self, *names: str) -> tuple[int, ...]:
+        """Return the times of change of the folder and of files in it, by which a renewal is noticed."""
+        found = []
+        for path in (self.path, *(self.path / name for name in names)):
+            found.append(0)
+            with suppress(OSError):
+                found[-1] = path.stat().st_mtime_ns
         return tuple(found)
 
     def _find(self, role: Role, cell: str) -> Identity | None:

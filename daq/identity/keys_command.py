@@ -58,6 +58,7 @@ def keys(
     from armident.daq.identity import OF_PLANT, VARIABLE
     from armident.daq.identity import plant as of_plant
     from armident.daq.identity.access import ROUTER_FILE
+    from armident.daq.identity.certificates import REVOKED
     from armident.daq.identity.folder import key_folder
 
     addresses, now = address or [], datetime.now(UTC)
@@ -88,12 +89,13 @@ def keys(
     elif action == "renew" and subject == of_plant.AUTHORITY:
         of_plant.renew_authority(path)
         print(f"{path / 'authority.pem'}: new authority; the former ones stay trusted until they end")
-        print("first copy it to all hosts and restart the router, then: armident keys renew --all")
+        print(f"first copy it and {REVOKED} to all hosts and restart the router, then: armident keys renew --all")
     elif action == "renew":
         made.append(of_plant.renew(path, str(subject), addresses, days))
     elif action == "revoke":
         of_plant.revoke(path, str(subject))
-        print(f"{subject}: revoked once the router has started again with {path / ROUTER_FILE}")
+        print(f"{subject}: revoked once the router has started again with {path / ROUTER_FILE},")
+        print(f"  and elsewhere once {path / REVOKED} is in the folder of keys of the host")
     elif action == "router":
         of_plant.write_router(path)
         print(path / ROUTER_FILE)
@@ -109,7 +111,7 @@ def keys(
     else:
         raise ConfigError(f"no action {action!r}; expected init, enrol, show, check, renew, revoke or router")
     for each in made:
-        files = f"{path}/{each.name}.pem, {each.name}.key and authority.pem"
+        files = f"{path}/{each.name}.pem, {each.name}.key, authority.pem and {REVOKED}"
         print(f"{each.name}: valid until {each.certificate.not_valid_after_utc:%Y-%m-%d}")
         print(f"  copy {files} to {OF_PLANT} on its host")
     if action == "enrol":

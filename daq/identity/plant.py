@@ -20,7 +20,9 @@ from armident.configs.reasons import reason_of
 from armident.daq.identity.access import ROUTER_FILE, explained, host_of, is_loopback, router_file, router_name
 from armident.daq.identity.certificates import (
     ANY_CELL,
+    REVOKED,
     ROLES,
+    Authority,
     Identity,
     Role,
     identity_of,
@@ -150,6 +152,8 @@ def enrol(folder: Path, role: str, cell: str | None, name: str | None, addresses
 def renew(folder: Path, name: str, addresses: Sequence[str], days: int) -> Identity:
     """Replace certificate and key of a name; role and cell stay, and the addresses unless others are given."""
     old = _known(folder, name)
+    # A former certificate is valid until it ends: a revocation needs it.
+    write_whole(folder / f"{name}.pem.former", pem_of(old.certificate, *_former(folder, name)), 0o644)
     return _issue(folder, old.role, old.cell, name, addresses or old.addresses, days)
 
 
@@ -161,15 +165,18 @@ def renew_authority(folder: Path) -> None:
     # In this order an interrupted renewal leaves the former key, which is still trusted.
     write_whole(folder / "authority.pem", pem_of(new.certificate, *old), 0o644)
     write_key(folder / "authority.key", new.key)
+    _write_revoked(folder, new)
 
 
 def revoke(folder: Path, name: str) -> None:
-    """Remove a name from the access control of the router, and keep it from being enrolled again."""
-    read_authority(folder)
-    if _known(folder, name).role == "router":
+    """Remove a name from the access control, add its certificates to the revocation list, and never enrol it again."""
+    authority, own = read_authority(folder), _known(folder, name)
+    if own.role == "router":
         raise ConfigError(f"{name}: a router is not revoked: make a new authority (keys init), and enrol all names")
-    (folder / f"{name}.pem").rename(_revoked(folder, name))
-    (folder / f"{name}.key").unlink(missing_ok=True)
+    write_whole(_revoked(folder, name), pem_of(own.certificate, *_former(folder, name)), 0o644)
+    _write_revoked(folder, authority)
+    for end in ("pem", "key", "pem.former"):
+        (folder / f"{name}.{end}").unlink(missing_ok=True)
     write_router(folder)
 
 
@@ -305,6 +312,7 @@ def _issue(folder: Path, role: Role, cell: str, name: str, addresses: Sequence[s
         raise ConfigError(f"the authority in {folder} has expired; run: armident keys renew {AUTHORITY}")
     identity = authority.issue(role, cell, name, addresses, days)
     write_identity(folder, identity)
+    _write_revoked(folder, authority)
     write_router(folder)
     return identity
 
@@ -337,6 +345,16 @@ def _router_text(folder: Path) -> str:
 
 def _revoked(folder: Path, name: str) -> Path:
     return folder / f"{name}.pem.revoked"
+
+
+def _write_revoked(folder: Path, authority: Authority) -> None:
+    revoked = [each for path in sorted(folder.glob("*.pem.revoked")) for each in read_certificates(path)]
+    write_whole(folder / REVOKED, authority.revocation_list(revoked), 0o644)
+
+
+def _former(folder: Path, name: str) -> tuple[x509.Certificate, ...]:
+    path = folder / f"{name}.pem.former"
+    return read_certificates(path) if path.exists() else ()
 
 
 def _check_name(name: str, option: str) -> str:

@@ -21,6 +21,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from armident.configs import ConfigError, DataError, SessionConfig
 from armident.daq.identity.certificates import (
     ANY_CELL,
+    REVOKED,
     Identity,
     Role,
     check_dates,
@@ -142,13 +143,13 @@ class Trust:
     def _certificate(self, data: bytes) -> x509.Certificate:
         """Return a certificate that is valid now; its chain is checked once."""
         at = datetime.fromtimestamp(self._clock() / 1e9, UTC)
-        if self._folder.stamp("authority.pem") != self._stamp:
+        if self._folder.stamp("authority.pem", REVOKED) != self._stamp:
             # While the file is replaced, the known authorities count.
             with suppress(ConfigError):
                 self._load()
         certificate = self._known.get(data)
         if certificate is None:
-            certificate = trusted_certificate(data, self._authorities, at)
+            certificate = trusted_certificate(data, self._authorities, at, self._revoked)
             if len(self._known) >= _MOST_CERTIFICATES:
                 self._known.clear()
             self._known[data] = certificate
@@ -157,8 +158,8 @@ class Trust:
 
     def _load(self) -> None:
         # Before it is read: what is replaced meanwhile is read again.
-        self._stamp = self._folder.stamp("authority.pem")
-        self._authorities = self._folder.authority_certificates()
+        self._stamp = self._folder.stamp("authority.pem", REVOKED)
+        self._authorities, self._revoked = self._folder.authority_certificates(), self._folder.revoked()
         self._known.clear()
 
 

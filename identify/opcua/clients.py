@@ -4,6 +4,7 @@ import asyncio
 import logging
 import secrets
 import socket
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -17,7 +18,7 @@ from asyncua.server.internal_session import InternalSession
 from asyncua.server.user_managers import UserManager
 
 from armident.configs import ConfigError, DataError
-from armident.daq.identity.certificates import signer_of
+from armident.daq.identity.certificates import identity_of
 from armident.daq.identity.folder import KeyFolder
 from armident.daq.streaming import Refusals
 
@@ -31,6 +32,13 @@ LARGEST, SMALLEST_BUFFER = 1 << 20, 8192
 """Largest message, and smallest buffer of a client (OPC 10000-6, 7.1.2.3), bytes."""
 
 
+@dataclass
+class _User(User):
+    """User, with the certificate (DER) by which he signed in; on loopback perhaps none."""
+
+    certificate: bytes | None = None
+
+
 class Clients(UserManager):
     """Those who may sign in: on loopback anybody; with the keys of a plant, holders of a certificate of ``opcua``."""
 
@@ -38,11 +46,11 @@ class Clients(UserManager):
         self.folder, self._refusals = folder, Refusals(log)
 
     def check(self, certificate: bytes | None) -> None:
-        """Raise ServiceError unless a certificate (DER) is one of the plant for OPC UA, and valid now."""
+        """Raise ServiceError unless a certificate (DER) is one of the plant for OPC UA, not revoked, and valid now."""
         if self.folder is None:
             return
         try:
-            role, _, name = signer_of(certificate or b"", self.folder.authority_certificates(), datetime.now(UTC))
+            role, _, name = identity_of(self.folder.trusted(certificate or b"", datetime.now(UTC)))
             if role != "opcua":
                 raise DataError(f"{name}: a certificate of the role {role}, not of opcua")
         except (DataError, ConfigError) as error:
@@ -54,7 +62,7 @@ class Clients(UserManager):
     ) -> User:
         """Return the user of a session; with the keys of a plant, the user has signed with ``certificate``."""
         self.check(certificate)
-        return User(UserRole.User)
+        return _User(UserRole.User, certificate=certificate)
 
 
 class _Session(InternalSession):
@@ -173,6 +181,17 @@ class LimitedServer(Server):
     def __init__(self, clients: Clients, listening: socket.socket) -> None:
         super().__init__(_Sessions(clients))
         self._listening, self.limits = listening, _Limits(1 << 16, 1 << 16, 32, LARGEST)
+
+    def sign_out(self) -> None:
+        """End the connections of clients whose certificate has been revoked or has ended."""
+        for each in tuple(self.bserver.clients):
+            session: Any = each.processor and each.processor.session
+            if session and session.is_activated():
+                try:
+                    for certificate in (session._peer, session.user.certificate):
+                        self.iserver.user_manager.check(certificate)
+                except ServiceError:
+                    each.transport.abort()
 
     async def start(self) -> None:
         """Begin to serve."""

@@ -11,12 +11,10 @@ from pathlib import Path
 from asyncua import ua
 from cryptography import x509
 
-from armident.configs import ConfigError
 from armident.daq.identity.certificates import ANY_CELL, Identity
-from armident.daq.identity.folder import KeyFolder, key_folder
 from armident.identify.opcua.clients import Clients, LimitedServer
 from armident.identify.opcua.nodes import Nodes
-from armident.identify.page.addresses import address_of, bound, is_loopback
+from armident.identify.page.addresses import address_of, bound, keys_for
 from armident.identify.page.cells import cells_in
 from armident.identify.page.plant import Plant
 from armident.systemd import Notifier
@@ -34,22 +32,14 @@ POLICIES = [
 def run_opcua(configs: Sequence[Path], out: Path | None, database: str | None, listen: str, keys: Path | None) -> None:
     """Carry out ``armident opcua`` until SIGTERM or SIGINT; ConfigError if address, keys or sessions are wrong."""
     host, port = address_of(listen)
-    folder = None if is_loopback(host) else key_folder(keys)
-    identity = None if folder is None else _identity(folder, listen)
+    folder = keys_for(host, listen, keys)
+    identity = None if folder is None else folder.identity("opcua", ANY_CELL)
     cells, read = cells_in(configs, out, database), threading.Event()
     # It reports each wrong request of a stranger with a traceback.
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)
     with closing(bound(host, port, listen)) as listening, Plant(cells, read.set, listens=False) as plant:
         server = LimitedServer(Clients(folder), listening)
         asyncio.run(_serve(server, identity, plant, f"opc.tcp://{host}:{listening.getsockname()[1]}/", read))
-
-
-def _identity(folder: KeyFolder, listen: str) -> Identity:
-    """Return the identity of the server; ConfigError if the folder is none of a plant, or has none."""
-    if folder.local:
-        reason = "other machines may only connect with keys of a plant; run: armident keys init"
-        raise ConfigError(f"--listen {listen}: {reason}")
-    return folder.identity("opcua", ANY_CELL)
 
 
 async def _serve(
@@ -76,6 +66,7 @@ async def _serve(
             print(f"opcua: {url} ({number})", flush=True)
             notifier.ready(f"{number} at {url}")
             while not stopped.is_set():
+                server.sign_out()
                 for name in plant.cells:
                     await nodes.update(plant.view(name))
                 if read.is_set():

@@ -2,8 +2,10 @@
 
 import ipaddress
 import socket
+from pathlib import Path
 
 from armident.configs import ConfigError
+from armident.daq.identity.folder import KeyFolder, key_folder
 
 
 def address_of(listen: str) -> tuple[str, int]:
@@ -20,6 +22,15 @@ def is_loopback(host: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return False
+
+
+def keys_for(host: str, listen: str, keys: Path | None) -> KeyFolder | None:
+    """Return the keys of the plant, which other machines need, ``None`` on loopback; ConfigError if there are none."""
+    folder = None if is_loopback(host) else key_folder(keys)
+    if folder is not None and folder.local:
+        reason = "other machines may only connect with keys of a plant; run: armident keys init"
+        raise ConfigError(f"--listen {listen}: {reason}")
+    return folder
 
 
 def bound(host: str, port: int, listen: str) -> socket.socket:

@@ -225,7 +225,7 @@ class CellView:
             yield Problem("act", f"The arm has {self.drift.words}", step, self.drift.command)
         last = self.identification
         if last is not None and last.problem is not None:
-            recording = shlex.quote(f"{last.name.rpartition('.')[0]}.mcap")
+            recording = shlex.quote(str(self.cell.folders[-1] / f"{last.name.rpartition('.')[0]}.mcap"))
             yield Problem("act", last.problem, "Identify the recording again", f"armident identify {recording}")
         elif last is not None and isinstance(last.document, IdentificationDocument):
             for reason in last.document.reasons[:1]:

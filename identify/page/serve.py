@@ -5,17 +5,22 @@ import signal
 import ssl
 from collections.abc import Sequence
 from contextlib import closing
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import uvicorn
 from cryptography import x509
+from starlette.responses import PlainTextResponse
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from armident.configs import ConfigError
-from armident.daq.identity.certificates import ANY_CELL
-from armident.daq.identity.folder import KeyFolder, key_folder
-from armident.identify.page.addresses import address_of, bound, is_loopback
+from armident.configs import ConfigError, DataError
+from armident.daq.identity.certificates import ANY_CELL, identity_of
+from armident.daq.identity.folder import KeyFolder
+from armident.daq.streaming import Refusals
+from armident.identify.page.addresses import address_of, bound, keys_for
 from armident.identify.page.cells import cells_in
 from armident.identify.page.plant import Plant
 from armident.identify.page.site import site
@@ -31,7 +36,8 @@ CONNECTIONS = 64
 def run_page(configs: Sequence[Path], out: Path | None, database: str | None, listen: str, keys: Path | None) -> None:
     """Carry out ``armident page`` until SIGTERM or SIGINT; ConfigError if address, keys or sessions are wrong."""
     host, port = address_of(listen)
-    hosts, security = (LOOPBACK, {}) if is_loopback(host) else sign_in(key_folder(keys), listen)
+    folder = keys_for(host, listen, keys)
+    hosts, security = (LOOPBACK, {}) if folder is None else _sign_in(folder)
     cells = cells_in(configs, out, database)
     number = "1 cell" if len(cells) == 1 else f"{len(cells)} cells"
     with (
@@ -58,15 +64,8 @@ def run_page(configs: Sequence[Path], out: Path | None, database: str | None, li
         notifier.stopping()
 
 
-def sign_in(folder: KeyFolder, listen: str) -> tuple[Sequence[str], dict[str, Any]]:
-    """Return the names in the certificate of the page, and the options of mutual TLS with the keys of a plant.
-
-    ConfigError if the folder is none of a plant, or has no identity of a viewer of all cells with addresses.
-    """
-    if folder.local:
-        raise ConfigError(
-            f"--listen {listen}: other machines may only connect with keys of a plant; run: armident keys init"
-        )
+def _sign_in(folder: KeyFolder) -> tuple[Sequence[str], dict[str, Any]]:
+    """Return the names in the certificate of the page, a viewer of all cells, and the options of mutual TLS."""
     identity = folder.identity("viewer", ANY_CELL)
     try:
         names = identity.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -80,7 +79,29 @@ def sign_in(folder: KeyFolder, listen: str) -> tuple[Sequence[str], dict[str, An
         f"ssl_{kind}file": folder.path / f"{identity.name}.{end}" for kind, end in (("cert", "pem"), ("key", "key"))
     }
     authority = folder.path / "authority.pem"
-    return hosts, files | {"ssl_ca_certs": authority, "ssl_cert_reqs": ssl.CERT_REQUIRED}
+    tls = {"ssl_ca_certs": authority, "ssl_cert_reqs": ssl.CERT_REQUIRED}
+    return hosts, files | tls | {"http": partial(_Connection, folder, Refusals(log))}
+
+
+class _Connection(H11Protocol):
+    """Connection of a browser, whose certificate must count at each request: it is revoked or ends meanwhile."""
+
+    def __init__(self, folder: KeyFolder, refusals: Refusals, **options: Any) -> None:
+        super().__init__(**options)
+        self._folder, self._refusals = folder, refusals
+
+    def data_received(self, data: bytes) -> None:
+        certificate = self.transport.get_extra_info("ssl_object").getpeercert(binary_form=True)
+        try:
+            role, cell, name = identity_of(self._folder.trusted(certificate, datetime.now(UTC)))
+            if role not in ("viewer", "operator") or cell != ANY_CELL:
+                raise DataError(f"{name}: not a viewer or operator of all cells, which this page shows")
+        except (DataError, ConfigError) as error:
+            self._refusals.refuse("browser", f"a browser is refused: {error}")
+            self.app = PlainTextResponse(
+                f"{error}\nrun where the authority is: armident keys enrol viewer --name NAME\n", 403
+            )
+        super().data_received(data)
 
 
 def _ended(_number: int, _frame: FrameType | None) -> None:

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
@@ -20,10 +21,11 @@ from armident.daq.identity.certificates import (
     Authority,
     Identity,
     Role,
+    identity_of,
     new_authority,
     pem_of,
     read_identity,
-    signer_of,
+    trusted_certificate,
     verify,
     write_identity,
     write_key,
@@ -44,6 +46,11 @@ def authority() -> Authority:
 
 def der(identity: Identity) -> bytes:
     return identity.certificate.public_bytes(Encoding.DER)
+
+
+def signer_of(certificate: bytes, authorities: Iterable[x509.Certificate], at: datetime) -> tuple[Role, str, str]:
+    """Return role, cell and name of a certificate that is trusted."""
+    return identity_of(trusted_certificate(certificate, authorities, at))
 
 
 def test_a_certificate_has_role_cell_name_and_addresses(authority: Authority) -> None:

@@ -11,19 +11,21 @@ import pytest
 import zenoh
 from typer.testing import CliRunner
 
-from armident.configs import ConfigError
+from armident.configs import ConfigError, DataError
 from armident.daq.cli import application
 from armident.daq.identity.certificates import (
+    identity_of,
     new_authority,
     pem_of,
     read_authority,
     read_certificates,
     read_identity,
-    signer_of,
+    trusted_certificate,
     write_identity,
     write_key,
     write_whole,
 )
+from armident.daq.identity.folder import KeyFolder
 from armident.daq.identity.plant import (
     Countdown,
     certificate_ends,
@@ -67,7 +69,7 @@ def test_a_plant_is_made_by_the_commands_and_says_who_may_do_what(tmp_path: Path
     assert "offline" in said
     code, said, _ = run("enrol", "capture", "--cell", "press_7", "--address", "192.0.2.7", *folder)
     assert code == 0
-    assert "capture.press_7.pem, capture.press_7.key and authority.pem to /etc/armident/keys" in said
+    assert "capture.press_7.pem, capture.press_7.key, authority.pem and authority.crl to /etc/armident/keys" in said
     assert "router.json5 to the host of the router" in said
     run("enrol", "viewer", "--name", "anna", "--cell", "press_7", *folder)
     run("enrol", "operator", "--name", "bert", *folder)
@@ -243,7 +245,7 @@ def test_a_renewal_keeps_name_role_cell_and_addresses_with_a_new_key(plant: Path
 def test_an_application_of_opc_ua_has_no_part_in_zenoh(plant: Path) -> None:
     code, said, _ = run("enrol", "opcua", "--name", "scada", "--address", "urn:scada.example:client", "--folder", plant)
     assert code == 0
-    assert "opcua.scada.pem, opcua.scada.key and authority.pem" in said
+    assert "opcua.scada.pem, opcua.scada.key, authority.pem and authority.crl" in said
     assert "opcua" not in (plant / "router.json5").read_text()
     renewed = renew(plant, "opcua.scada", (), 30)
     assert [each.addresses for each in enrolled(plant) if each.role == "opcua"] == [["urn:scada.example:client"]]
@@ -274,7 +276,7 @@ def test_a_renewed_authority_still_trusts_the_former_one(plant: Path) -> None:
     trusted = read_certificates(plant / "authority.pem")
     assert [len(trusted), problems(plant)] == [2, []]
     for identity in (old, new):
-        assert signer_of(der(identity), trusted, now())[2] == "capture.press_7"
+        assert identity_of(trusted_certificate(der(identity), trusted, now()))[2] == "capture.press_7"
     assert read_authority(plant).certificate == trusted[0]
 
 
@@ -285,6 +287,35 @@ def test_a_revoked_name_has_no_access_and_is_not_given_again(plant: Path) -> Non
     assert problems(plant) == []
     with pytest.raises(ConfigError, match=r"viewer\.anna was revoked; choose another --name"):
         enrol(plant, "viewer", "press_7", "anna", [], 365)
+
+
+def test_all_certificates_of_a_revoked_name_are_refused_and_no_others(plant: Path) -> None:
+    """Those before a renewal, and of a former authority, are valid until they end: a thief may have one of them."""
+    stolen, other = read_identity(plant / "viewer.anna.pem"), read_identity(plant / "capture.press_7.pem")
+    stolen_later = renew(plant, "viewer.anna", (), 30)
+    folder = KeyFolder(plant)
+    assert not folder.revoked()
+    assert run("renew", "authority", "--folder", plant)[0] == 0
+    stolen_last = renew(plant, "viewer.anna", (), 30)
+    code, said, _ = run("revoke", "viewer.anna", "--folder", plant)
+    assert (code, "keys/authority.crl is in the folder of keys" in said) == (0, True)
+    for identity in (stolen, stolen_later, stolen_last):
+        with pytest.raises(DataError, match=r"viewer\.anna: the certificate was revoked"):
+            folder.trusted(der(identity), now())
+    assert identity_of(folder.trusted(der(other), now()))[2] == "capture.press_7"
+    # The list of the next authority has them, too.
+    assert run("renew", "authority", "--folder", plant)[0] == 0
+    with pytest.raises(DataError, match="was revoked"):
+        folder.trusted(der(stolen), now())
+
+
+@pytest.mark.parametrize("damage", ["foreign", "cut", "empty"])
+def test_nobody_is_trusted_with_a_revocation_list_that_is_none_of_the_plant(plant: Path, damage: str) -> None:
+    path, anna = plant / "authority.crl", read_identity(plant / "viewer.anna.pem")
+    foreign = new_authority("werk", 30).revocation_list([])
+    path.write_bytes({"foreign": foreign, "cut": path.read_bytes()[:-40], "empty": b""}[damage])
+    with pytest.raises(ConfigError, match=r"authority\.crl: .*copy it again"):
+        KeyFolder(plant).trusted(der(anna), now())
 
 
 def test_a_certificate_does_not_outlive_its_authority(plant: Path) -> None:

@@ -32,6 +32,11 @@ def test_renewed_certificates_and_authorities_are_used_without_a_restart(tmp_pat
     assert trust.check("publish", KEY, b"x", after).name == "capture.c"
     with pytest.raises(DataError, match="another authority"):
         trust.check("publish", KEY, b"x", before)
+    write_whole(tmp_path / "authority.crl", second.revocation_list([signer.identity.certificate]), 0o644)
+    with pytest.raises(DataError, match=r"capture\.c: the certificate was revoked"):
+        trust.check("publish", KEY, b"x", after)
+    write_whole(tmp_path / "authority.crl", second.revocation_list([]), 0o644)
+    assert trust.check("publish", KEY, b"x", after).name == "capture.c"
     # A renewal that is under way, or failed, stops nobody.
     (tmp_path / "capture.c.key").write_bytes(b"")
     (tmp_path / "authority.pem").unlink()

@@ -25,10 +25,13 @@ from typer.testing import CliRunner
 from armident.daq.cli import application
 from armident.daq.identity.certificates import (
     ANY_CELL,
+    Authority,
     new_authority,
     pem_of,
+    read_authority,
     read_certificates,
     write_identity,
+    write_key,
     write_whole,
 )
 from armident.identify.opcua.clients import FASTEST_MS, NODES, SESSIONS, SLOWEST_MS, SUBSCRIPTIONS
@@ -126,6 +129,12 @@ def test_clients_change_nothing(url: str) -> None:
     asked(url, question)
 
 
+def revoke(folder: Path, authority: Authority, *names: str) -> None:
+    """Give the server the revocation list of these names."""
+    revoked = [certificate for name in names for certificate in read_certificates(folder / f"opcua.{name}.pem")]
+    write_whole(folder / "server" / "authority.crl", authority.revocation_list(revoked), 0o644)
+
+
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders of keys: those of the server, and of clients of this plant and of another one of its name."""
@@ -133,9 +142,13 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     authority, foreign = new_authority("plant", 30), new_authority("plant", 30)
     (folder / "server").mkdir()
     write_whole(folder / "server" / "authority.pem", pem_of(authority.certificate), 0o644)
+    write_key(folder / "authority.key", authority.key)
+    write_whole(folder / "authority.pem", pem_of(authority.certificate), 0o644)
     write_identity(folder / "server", authority.issue("opcua", ANY_CELL, "opcua.server", ("127.0.0.1",), 30))
-    for who, name, begin in ((authority, "anna", now), (foreign, "eve", now), (authority, "old", now - timedelta(40))):
+    people = [(authority, name, now) for name in ("anna", "revoked", "leaver")]
+    for who, name, begin in (*people, (foreign, "eve", now), (authority, "old", now - timedelta(40))):
         write_identity(folder, who.issue("opcua", ANY_CELL, f"opcua.{name}", (), 30, begin))
+    revoke(folder, authority, "revoked")
     return folder
 
 
@@ -176,7 +189,8 @@ def test_a_client_of_the_plant_reads_and_changes_nothing(secured: str, keys: Pat
         (None, None, BadCertificateUntrusted), (None, "anna", BadCertificateUntrusted),
         ("anna", None, BadIdentityTokenRejected), ("eve", "eve", BadCertificateUntrusted),
         ("anna", "eve", BadCertificateUntrusted), ("eve", "anna", BadCertificateUntrusted),
-        ("old", "old", BadCertificateUntrusted),
+        ("old", "old", BadCertificateUntrusted), ("anna", "revoked", BadCertificateUntrusted),
+        ("revoked", "anna", BadCertificateUntrusted),
     ],
 )  # fmt: skip
 def test_nobody_else_signs_in(
@@ -187,7 +201,7 @@ def test_nobody_else_signs_in(
     reason: type[ua.UaError],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Anonymous, without encryption, of another authority, expired: of the channel, of the user, or of both.
+    """Anonymous, without encryption, of another authority, expired, revoked: of the channel, of the user, or of both.
 
     The client asks although the server offers no such endpoint.
     """
@@ -218,6 +232,27 @@ def test_a_certificate_that_is_only_stated_does_not_count(secured: str, keys: Pa
 
     with pytest.raises(BadCertificateUntrusted):
         asyncio.run(ask())
+
+
+def test_a_client_that_is_revoked_is_signed_out(secured: str, keys: Path) -> None:
+    async def read_on(client: Client) -> None:
+        while True:
+            await model(client)
+            await asyncio.sleep(0.1)
+
+    async def ask() -> None:
+        async with await client_of(secured, keys, "anna", "anna") as anna:
+            leaver = await client_of(secured, keys, "anna", "leaver")
+            await leaver.connect()
+            assert await model(leaver) == "emps"
+            revoke(keys, read_authority(keys), "revoked", "leaver")
+            with pytest.raises((ConnectionError, ua.UaError)):
+                await asyncio.wait_for(read_on(leaver), LONGEST_S)
+            assert await model(anna) == "emps"
+            with suppress(ConnectionError, ua.UaError):
+                await leaver.disconnect()
+
+    asyncio.run(ask())
 
 
 def test_sessions_beyond_the_limit_are_refused_until_others_end(url: str) -> None:

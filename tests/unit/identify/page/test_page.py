@@ -292,7 +292,10 @@ def test_what_is_damaged_is_said_in_its_place_and_the_rest_is_shown(
 
 def test_a_document_that_is_nested_too_deeply_is_said(copied: Path, serving: Serve) -> None:
     (copied / "press_2" / f"{NAME}.identification/identification.json").write_text("[" * 100_000)
-    assert "cannot be read (RecursionError)" in serving(copied).get("/")[2]
+    html = serving(copied).get("/")[2]
+    assert "cannot be read (RecursionError)" in html
+    # The command works in any folder.
+    assert f"armident identify {copied / 'press_2' / NAME}.mcap" in html
 
 
 def test_a_ledger_of_another_version_and_a_wrong_session_are_said(copied: Path, serving: Serve) -> None:

@@ -8,7 +8,7 @@ import ssl
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -16,7 +16,16 @@ from typer.testing import CliRunner
 
 from armident.configs import ConfigError
 from armident.daq.cli import application
-from armident.daq.identity.certificates import ANY_CELL, Authority, new_authority, pem_of, write_identity, write_whole
+from armident.daq.identity.certificates import (
+    ANY_CELL,
+    Authority,
+    Role,
+    new_authority,
+    pem_of,
+    read_certificates,
+    write_identity,
+    write_whole,
+)
 from armident.identify.page.addresses import address_of, is_loopback
 from tests.fixtures import plant
 
@@ -123,7 +132,7 @@ def test_only_loopback_needs_no_keys(listen: str, loopback: bool) -> None:
 
 
 def test_other_machines_sign_in_with_a_certificate_of_the_plant(folder: Path, tmp_path: Path) -> None:
-    keys(tmp_path, "plant", "anna")
+    authority = keys(tmp_path, "plant", "anna", "otto")
     keys(tmp_path, "foreign", "eve")
     address = ("--listen", "0.0.0.0:0", "--keys", str(tmp_path / "plant"))
     with running("--config", str(folder), *address) as (url, _):
@@ -149,3 +158,21 @@ def test_other_machines_sign_in_with_a_certificate_of_the_plant(folder: Path, tm
         with pytest.raises((ConnectionError, http.client.HTTPException)):
             fetch(f"127.0.0.1:{port}")
         assert asked(anna) == 200
+
+        otto = tmp_path / "plant_people" / "viewer.otto"
+        context = ssl.create_default_context(cafile=str(tmp_path / "plant" / "authority.pem"))
+        context.load_cert_chain(f"{otto}.pem", f"{otto}.key")
+        with closing(http.client.HTTPSConnection("127.0.0.1", port, context=context, timeout=30)) as kept:
+            kept.request("GET", "/", headers={"Host": "page.plant"})
+            assert b"press_4" in kept.getresponse().read()
+            revoked = authority.revocation_list(read_certificates(tmp_path / "plant_people" / "viewer.otto.pem"))
+            write_whole(tmp_path / "plant" / "authority.crl", revoked, 0o644)
+            kept.request("GET", "/", headers={"Host": "page.plant"})
+            answer = kept.getresponse()
+            assert (answer.status, b"viewer.otto: the certificate was revoked" in answer.read()) == (403, True)
+        assert [asked(otto), asked(anna)] == [403, 200]
+        # The page shows all cells; another role reads none of them.
+        others: tuple[tuple[Role, str], ...] = (("viewer", "press_2"), ("opcua", ANY_CELL), ("capture", "press_2"))
+        for role, cell in others:
+            write_identity(tmp_path, authority.issue(role, cell, f"{role}.x", (), 30))
+            assert asked(tmp_path / f"{role}.x") == 403
