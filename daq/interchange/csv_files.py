@@ -3,7 +3,7 @@
 import csv
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -34,6 +34,7 @@ class CsvTable:
     """Values (N, columns) of a table in a text file; NaN where a cell is empty, and in the whole row of a damaged line.
 
     ``header``: ``None`` if there is none. ``units``: from the line below it, or empty. ``lines`` (N,): of each row.
+    ``words``: first cell of each column of text.
     """
 
     header: list[str] | None
@@ -41,11 +42,12 @@ class CsvTable:
     values: NDArray[np.float64]
     lines: NDArray[np.int64]
     notes: tuple[str, ...] = ()
+    words: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass
 class _Head:
-    """Beginning of a file: the columns, those of text among them, and the first line of values, from 1."""
+    """Beginning of a file: the columns, those of text among them, and the first line of values and its cells."""
 
     delimiter: str | None
     columns: int
@@ -54,6 +56,7 @@ class _Head:
     header: list[str] | None = None
     units: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    cells: Sequence[str] = ()
 
 
 def read_csv(path: Path) -> CsvTable:
@@ -124,7 +127,7 @@ def _head(path: Path, lines: Iterator[str]) -> _Head:
             return _with_header(head, before[:-1])
         if words is None or words:
             own_names = any(len(cells_of(each, delimiter)) == len(cells) for _, each, _ in before)
-            mixed = _Head(delimiter, len(cells), number, words) if words and own_names else None
+            mixed = _Head(delimiter, len(cells), number, words, cells=cells) if words and own_names else None
             before.append((number, text.lstrip("#%/ ") if comment else text, comment))
             continue
         return _with_header(_Head(delimiter, len(cells), number), before, ends_empty=not cells[-1])
@@ -138,7 +141,7 @@ def _after_words(line: _Head | None, cells: Sequence[str], words: frozenset[int]
     """
     if line is None or words is None or len(cells) != line.columns or not words <= line.text:
         return None
-    return replace(line, text=words) if all(cells[k][0].isalpha() for k in words) else None
+    return replace(line, text=words) if all(cells[k][0].isalpha() or cells[k][0] in "[(" for k in words) else None
 
 
 def _no_values(before: Sequence[tuple[int, str, bool]]) -> str:
@@ -321,7 +324,8 @@ def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
         notes.append(f"decimal commas are read as decimal points ({commas} lines)")
     if repeated:
         notes.append(f"repeated header ignored: {repeated} times")
-    return CsvTable(head.header, head.units, values, np.array(numbers), tuple(notes))
+    words = {head.header[k]: head.cells[k] for k in sorted(head.text) if head.header and k < len(head.cells)}
+    return CsvTable(head.header, head.units, values, np.array(numbers), tuple(notes), words)
 
 
 def _refuse_other_header(path: Path, number: int, cells: Sequence[str], head: _Head) -> None:

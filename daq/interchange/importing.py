@@ -178,7 +178,7 @@ def _repaired(
         times = rows.times / (usual * rate_hz) if usual > 0.0 else rows.row / rate_hz
     effort = next(rows.values[name] for name in EFFORTS if name in rows.values)
     q, demand, polled = rows.values["position"], rows.values.get("demand"), options.get("polled", False)
-    found = repair(q, effort, demand, times, robot, side, polled=polled)
+    found = repair(q, effort, demand, times, robot, side, polled=polled, torque="torque" in rows.values)
     if not found.notes:
         return rows, ()
     values = {**rows.values, "position": found.position}
