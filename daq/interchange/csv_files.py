@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError
+from armident.daq.interchange.column_units import SCALES, plain_unit
 from armident.daq.interchange.text_files import encoding_of, excerpt
 
 _COMMENTS = ("#", "%", "//")
@@ -27,6 +28,8 @@ _OTHER_DATE = re.compile(r"\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d{1,2}:\d\d:\d\d")
 _UNIT = re.compile(
     r"[\[(]?\s*(?:s|sec|ms|us|ns|µs|rad|deg|°|m|mm|n\.?\s?m|nm|a|ma|v|-|rad/s|m/s)\s*[\])]?$", re.IGNORECASE
 )
+
+_UNITS_WORD = re.compile(r"(?:units?|einheit(?:en)?)\s*[:=]\s*", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ def _head(path: Path, lines: Iterator[str]) -> _Head:
         if words is None or words:
             own_names = any(len(cells_of(each, delimiter)) == len(cells) for _, each, _ in before)
             mixed = _Head(delimiter, len(cells), number, words, cells=cells) if words and own_names else None
-            before.append((number, text.lstrip("#%/ ") if comment else text, comment))
+            before.append((number, _UNITS_WORD.sub("", text.lstrip("#%/ ") if comment else text), comment))
             continue
         return _with_header(_Head(delimiter, len(cells), number), before, ends_empty=not cells[-1])
     raise DataError(f"{path}: no values in it{_no_values(before)}")
@@ -169,14 +172,16 @@ def _with_header(head: _Head, before: Sequence[tuple[int, str, bool]], *, ends_e
         # A header that does not fit the values is named by the caller.
         fits = [cells_of(before[-1][1], head.delimiter)]
     fits = [cells[: head.columns] if not any(cells[head.columns :]) else cells for cells in fits]
-    named = [cells for cells in fits if not all(not cell or _UNIT.match(cell) for cell in cells)]
+    units = [c for c in fits if all(not cell or _UNIT.match(cell) or plain_unit(cell) in SCALES for cell in c)]
+    named = [cells for cells in fits if cells not in units]
     if len(named) > 1 and _repeats(named[-1]) and not _repeats(named[-2]):
         # Names of columns differ, units below them do not.
         named.pop()
     if head.columns > 1 or (fits and not before[-1][2]):
         if named:
             head.header = named[-1]
-            head.units = next((c for c in fits[fits.index(named[-1]) + 1 :] if len(c) == head.columns), [])
+            below = fits[fits.index(named[-1]) + 1 :]
+            head.units = next((c for c in (*below, *units[::-1]) if len(c) == head.columns), [])
         elif fits:
             head.header = fits[-1]
     return head

@@ -38,7 +38,7 @@ _UNIT = re.compile(r"^(.*?)\s*[\[(]([^\])]*[^\])\d\s][^\])]*)[\])]$")
 """A unit in brackets; digits alone are the number of a joint."""
 _TIME_UNIT = re.compile(r"^(.*?)(?:_|\s*/\s*)(s|sec|ms|us|ns)$", re.IGNORECASE)
 _UNIT_AT_END = re.compile(
-    r"^(.*[^\W_])(?:[_ ]|\s*/\s*)(rad|mrad|deg(?:rees?)?|°|mm|n ?m|n mm|n cm|mn ?m|ma)$", re.IGNORECASE
+    r"^(.*?[^\W_])(?:[_ ]|\s*/\s*)(rad|mrad|deg(?:rees?)?|°|mm|n ?m|n mm|n cm|mn ?m|ma)$", re.IGNORECASE
 )
 
 Table = Mapping[str, NDArray[np.float64]]

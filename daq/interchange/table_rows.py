@@ -11,7 +11,7 @@ from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.clocks import descending, without_wraps
 from armident.daq.interchange.column_units import check_unit, time_unit
 from armident.daq.interchange.si_checks import OMITTED
-from armident.daq.interchange.table_columns import TableColumns, find_columns, find_time, unused_demand
+from armident.daq.interchange.table_columns import NAMES, TableColumns, find_columns, find_time, unused_demand
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.text_files import listed
 from armident.daq.recording.faults.zeros import never_measured
@@ -87,6 +87,9 @@ def complete_rows(
     notes = [note for columns in found.values() for note in columns.notes]
     if "demand" not in found and names.get("demand") != OMITTED and (unused := unused_demand(source.table)):
         notes.append(unused)
+    others = [name for name in source.table if name.lower() in NAMES["time"] and time is not None and name != time[0]]
+    if time is not None and others and "time" not in names:
+        notes.append(f"times taken from {time[0]}, not from {listed(others)}; --map time=NAME chooses")
     rows = TableRows(
         {quantity: np.array(columns.values, np.float64) for quantity, columns in found.items()},
         {quantity: columns.labels for quantity, columns in found.items()},
