@@ -359,10 +359,10 @@ def check_sync_period(path: Path, frames: Frames, session: SessionConfig, stated
     if syncs.size < _FEWEST:
         return []
     unit = next((u for u in ("ms", "us") if found and abs(found[0] * UNITS[u] / expected - 1.0) < _SAME_PERIOD), "")
-    if found and unit:
+    if unit:
         raise DataError(
-            f"{path}: SYNC comes every {found[0] * 1e-9:.4g} s in this log, but {configured}: its times are in {unit} (then "
-            f"name their column 'time [{unit}]'), or the session is another one"
+            f"{path}: SYNC would be {configured}, if the times of this log were in {unit}: name their column "
+            f"'time [{unit}]', or use the session that the log was recorded with"
         )
     if found is None or found[1] > _VERIFIED * expected:
         why = "all its times are equal" if not np.ptp(syncs["t_ns"]) else "its times have too few digits, or jump"

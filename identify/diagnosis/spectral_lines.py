@@ -18,7 +18,7 @@ BLOCK = 128
 """Independent frequencies from whose median the spectrum around a line is estimated."""
 
 ASIDE = 10.0
-"""Distance, in widths of a modulated line, of the spectrum it is compared with: sidebands raise the one nearer to it."""
+"""Distance, in widths of a modulated line, of the spectrum it is compared with: sidebands raise the nearer one."""
 
 PADDING = 2
 """Number of searched frequencies per independent one."""

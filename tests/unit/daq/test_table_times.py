@@ -277,6 +277,6 @@ def test_two_columns_of_times_are_named(tmp_path: Path) -> None:
 
 def test_durations_are_times(tmp_path: Path) -> None:
     values = motion()
-    arrays = {"t": (values[:, 0] * 1e9).round().astype("m8[ns]"), "q": values[:, 1 : N + 1], "tau": values[:, N + 1 :]}
-    np.savez(tmp_path / "a.npz", **arrays)
+    times = (values[:, 0] * 1e9).round().astype("m8[ns]")
+    np.savez(tmp_path / "a.npz", t=times, q=values[:, 1 : N + 1], tau=values[:, N + 1 :])
     assert import_recording(tmp_path / "a.npz", TX40).sample_rate_hz == pytest.approx(1000.0)
