@@ -220,7 +220,9 @@ def _check_rates(rate_hz: float | None, polled: bool, resample_hz: float | None)
 
 
 def _begin_ns(source: Source, rows: TableRows) -> int:
-    """Return the time of the first row, ns UTC, if the unit of the times has the date from which they count; else 0."""
+    """Return the time of the first row, ns UTC: of a stamp, or from the date in the unit of the times; else 0."""
+    if source.t_ns is not None:
+        return max(int(source.t_ns[rows.row[0]]), 0)
     date = source.units.get(rows.time_name, "").partition(SINCE)[2]
     try:
         start = int(np.datetime64(date.removesuffix("Z"), "ns").astype(np.int64)) if date else 0
