@@ -58,8 +58,6 @@ _HOLE_PERIODS = 10
 """Steps longer than this number of usual ones are not counted: SYNCs may be lacking there."""
 _VERIFIED = 0.4
 """Uncertainty of a SYNC period over that of the session up to which half and double of it are told from it."""
-_SAME_PERIOD = 0.1
-"""Largest relative difference of periods that are the same but for the unit."""
 _WRAPS_NS = (60_000_000_000, 65_536_000_000, 2**32 * 1000)
 """Times at which clocks of adapters begin again, ns: one minute and 16 bits of ms (SLCAN), 32 bits of us."""
 _WRAPS = tuple(2.0**bits * 10.0**-exponent for bits in (16, 32) for exponent in (0, 3, 6))
@@ -358,11 +356,11 @@ def check_sync_period(path: Path, frames: Frames, session: SessionConfig, stated
         raise ConfigError(f"{path}: --rate {stated_hz:g} contradicts the session: SYNC comes {configured}")
     if syncs.size < _FEWEST:
         return []
-    unit = next((u for u in ("ms", "us") if found and abs(found[0] * UNITS[u] / expected - 1.0) < _SAME_PERIOD), "")
+    unit = next((u for u in ("ms", "us") if found and abs(found[0] * UNITS[u] / expected - 1.0) < PERIOD_TOLERANCE), "")
     if unit:
         raise DataError(
-            f"{path}: SYNC would be {configured}, if the times of this log were in {unit}: name their column "
-            f"'time [{unit}]', or use the session that the log was recorded with"
+            f"{path}: times in {unit} fit SYNC {configured}, times in s do not: name their column 'time [{unit}]', or "
+            "use the session that the log was recorded with"
         )
     if found is None or found[1] > _VERIFIED * expected:
         why = "all its times are equal" if not np.ptp(syncs["t_ns"]) else "its times have too few digits, or jump"

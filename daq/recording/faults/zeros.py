@@ -11,7 +11,6 @@ Mask = NDArray[np.bool_]
 NOTHING = 1e-300
 """Magnitude below which an effort is 0 in every unit: memory that was never written holds such numbers."""
 
-
 FAR_BEYOND = 3.0
 """Effort over the usual ones (95 % quantile) from which one beyond the limit is no peak of a motion."""
 

@@ -73,7 +73,7 @@ def test_a_bus_log_in_csv_is_read_by_the_names_of_its_columns(tmp_path: Path, fo
 @pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("us", 1e6)])
 def test_times_without_their_unit_are_named(tmp_path: Path, unit: str, factor: float) -> None:
     rows = [f"{since(m) * factor:.9g},{m.arbitration_id:x},{m.data.hex()}" for m in messages()]
-    with pytest.raises(DataError, match=rf"if the times .* were in {unit}: name their column 'time \[{unit}\]'"):
+    with pytest.raises(DataError, match=rf"times in {unit} fit SYNC every .*: name their column 'time \[{unit}\]'"):
         import_recording(table(tmp_path / "a.csv", "time,id,data", rows), SESSION)
     assert same(import_recording(table(tmp_path / "b.csv", f"time [{unit}],id,data", rows), SESSION))
 
