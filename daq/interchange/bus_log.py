@@ -1,6 +1,5 @@
 """Conversion of recordings and logs of CAN tools by a session's mapping."""
 
-import hashlib
 import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.daq.interchange.clocks import check_sync_period, clock_steps, continuous
 from armident.daq.interchange.log_file import read_log
 from armident.daq.interchange.log_frames import LogFrames
+from armident.daq.interchange.text_files import NOTES, sha256_of
 from armident.daq.matching.assembler import Assembler, Batch
 from armident.daq.matching.streams import CapturedStream, bus_numbers, captured_streams, unknown_phase
 from armident.daq.recording import Gap, Recording, Stream
@@ -23,8 +23,6 @@ _BATCH = 4096
 _TURN_NS = 1_000_000_000
 _ANSWER_NS = 20_000
 """Time between frames of a SYNC in a log written from a recording, which has only the time of the SYNC, ns."""
-NOTES = "source_remarks"
-"""Key of the metadata with everything that an import left out or interpreted."""
 
 
 def recording_from_log(
@@ -82,7 +80,7 @@ def recording_from_log(
         found,
         tuple(gaps),
         counters=assembler.counters | {"log.foreign": log.foreign, "log.skipped": log.skipped},
-        metadata={"source": path.name, "source_sha256": _digest(path)} | ({NOTES: "; ".join(notes)} if notes else {}),
+        metadata={"source": path.name, "source_sha256": sha256_of(path)} | ({NOTES: "; ".join(notes)} if notes else {}),
     )
 
 
@@ -213,8 +211,3 @@ def _encoded(stream: CapturedStream, recorded: Stream) -> NDArray[np.uint8]:
     for name in dtype.names or ():
         records[name] = recorded.raw[name]
     return records.view(np.uint8).reshape(recorded.sync.size, joints, dtype.itemsize)
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -15,6 +15,10 @@ from armident.drivers.canopen.objects import COB_SYNC
 
 UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Units of times, s."""
+_LONGER: Mapping[str, float] = {"min": 60.0, "h": 3600.0, "days": 86400.0}
+"""Units of times that are recognised and not read, s: spreadsheets count days."""
+_SHORT_STEP_S = 1e-4
+"""Step below which times with impossible velocities may be in one of these units, s."""
 SLOWEST_HZ, FASTEST_HZ = 10.0, 100e3
 """Sampling rates of recordings of arms; a rate beyond them may be that of times in another unit, 1/s."""
 SLOWEST_SHARE, FASTEST_SHARE = 2e-3, 3.0
@@ -102,16 +106,22 @@ def in_seconds(
     if step <= 0.0:
         return times * UNITS[unit], ()
     share = _velocity_share(times, q, robot)
-    others = [u for u in UNITS if u != unit and _plausible(step * UNITS[u], share / UNITS[u])]
+    fast = step * UNITS[unit] < _SHORT_STEP_S and share > FASTEST_SHARE * UNITS[unit]
+    units = {**UNITS, **(_LONGER if fast else {})}
+    others = [u for u in units if u != unit and _plausible(step * units[u], share / units[u])]
     implausible = not _plausible(step * UNITS[unit], share / UNITS[unit])
     # A unit that is stated is believed, unless the rate is beyond every recording.
     if implausible and others and (not (stated or named) or step * UNITS[unit] < 1.0 / FASTEST_HZ):
         moved = f" and joints at {100 * share / UNITS[unit]:.2g} % of their velocity limits" if share else ""
-        rates = " and ".join(f"in {each} it would be {1.0 / (step * UNITS[each]):.6g} Hz" for each in others)
+        rates = " and ".join(f"in {each} it would be {1.0 / (step * units[each]):.6g} Hz" for each in others)
         # An option is advised only if no other unit is plausible.
+        advice = f"--time-unit {others[0]} reads it so" if len(others) == 1 else "state the unit with --time-unit"
+        if any(each in _LONGER for each in others):
+            advice = "convert the times to s"
+        elif step == 1.0 and np.all(steps == np.rint(steps)):
+            advice += "; if the column counts samples, omit it with --map time=- and give their --rate"
         raise DataError(
-            f"a step of {step:.6g} {unit} is a rate of {1.0 / (step * UNITS[unit]):.6g} Hz{moved}; {rates}: "
-            + (f"--time-unit {others[0]} reads it so" if len(others) == 1 else "state the unit with --time-unit")
+            f"a step of {step:.6g} {unit} is a rate of {1.0 / (step * UNITS[unit]):.6g} Hz{moved}; {rates}: {advice}"
         )
     note = (f"times are in {unit}, the unit in the column name",) if named and named != "s" and not stated else ()
     return (times - times[0]) * UNITS[unit], note
@@ -346,6 +356,12 @@ def check_sync_period(path: Path, frames: Frames, session: SessionConfig, stated
         raise ConfigError(f"{path}: --rate {stated_hz:g} contradicts the session: SYNC comes {configured}")
     if syncs.size < _FEWEST:
         return []
+    unit = next((u for u in ("ms", "us") if found and abs(found[0] * UNITS[u] / expected - 1.0) < PERIOD_TOLERANCE), "")
+    if unit:
+        raise DataError(
+            f"{path}: times in {unit} fit SYNC {configured}, times in s do not: name their column 'time [{unit}]', or "
+            "use the session that the log was recorded with"
+        )
     if found is None or found[1] > _VERIFIED * expected:
         why = "all its times are equal" if not np.ptp(syncs["t_ns"]) else "its times have too few digits, or jump"
         if stated_hz is None:

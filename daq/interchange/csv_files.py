@@ -3,7 +3,7 @@
 import csv
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError
+from armident.daq.interchange.column_units import SCALES, plain_unit
 from armident.daq.interchange.text_files import encoding_of, excerpt
 
 _COMMENTS = ("#", "%", "//")
@@ -28,12 +29,15 @@ _UNIT = re.compile(
     r"[\[(]?\s*(?:s|sec|ms|us|ns|µs|rad|deg|°|m|mm|n\.?\s?m|nm|a|ma|v|-|rad/s|m/s)\s*[\])]?$", re.IGNORECASE
 )
 
+_UNITS_WORD = re.compile(r"(?:units?|einheit(?:en)?)\s*[:=]\s*", re.IGNORECASE)
+
 
 @dataclass(frozen=True)
 class CsvTable:
     """Values (N, columns) of a table in a text file; NaN where a cell is empty, and in the whole row of a damaged line.
 
     ``header``: ``None`` if there is none. ``units``: from the line below it, or empty. ``lines`` (N,): of each row.
+    ``words``: first cell of each column of text.
     """
 
     header: list[str] | None
@@ -41,11 +45,12 @@ class CsvTable:
     values: NDArray[np.float64]
     lines: NDArray[np.int64]
     notes: tuple[str, ...] = ()
+    words: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass
 class _Head:
-    """Beginning of a file: the columns, those of text among them, and the first line of values, from 1."""
+    """Beginning of a file: the columns, those of text among them, and the first line of values and its cells."""
 
     delimiter: str | None
     columns: int
@@ -54,6 +59,7 @@ class _Head:
     header: list[str] | None = None
     units: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    cells: Sequence[str] = ()
 
 
 def read_csv(path: Path) -> CsvTable:
@@ -124,8 +130,8 @@ def _head(path: Path, lines: Iterator[str]) -> _Head:
             return _with_header(head, before[:-1])
         if words is None or words:
             own_names = any(len(cells_of(each, delimiter)) == len(cells) for _, each, _ in before)
-            mixed = _Head(delimiter, len(cells), number, words) if words and own_names else None
-            before.append((number, text.lstrip("#%/ ") if comment else text, comment))
+            mixed = _Head(delimiter, len(cells), number, words, cells=cells) if words and own_names else None
+            before.append((number, _UNITS_WORD.sub("", text.lstrip("#%/ ") if comment else text), comment))
             continue
         return _with_header(_Head(delimiter, len(cells), number), before, ends_empty=not cells[-1])
     raise DataError(f"{path}: no values in it{_no_values(before)}")
@@ -138,7 +144,7 @@ def _after_words(line: _Head | None, cells: Sequence[str], words: frozenset[int]
     """
     if line is None or words is None or len(cells) != line.columns or not words <= line.text:
         return None
-    return replace(line, text=words) if all(cells[k][0].isalpha() for k in words) else None
+    return replace(line, text=words) if all(cells[k][0].isalpha() or cells[k][0] in "[(" for k in words) else None
 
 
 def _no_values(before: Sequence[tuple[int, str, bool]]) -> str:
@@ -166,14 +172,16 @@ def _with_header(head: _Head, before: Sequence[tuple[int, str, bool]], *, ends_e
         # A header that does not fit the values is named by the caller.
         fits = [cells_of(before[-1][1], head.delimiter)]
     fits = [cells[: head.columns] if not any(cells[head.columns :]) else cells for cells in fits]
-    named = [cells for cells in fits if not all(not cell or _UNIT.match(cell) for cell in cells)]
+    units = [c for c in fits if all(not cell or _UNIT.match(cell) or plain_unit(cell) in SCALES for cell in c)]
+    named = [cells for cells in fits if cells not in units]
     if len(named) > 1 and _repeats(named[-1]) and not _repeats(named[-2]):
         # Names of columns differ, units below them do not.
         named.pop()
     if head.columns > 1 or (fits and not before[-1][2]):
         if named:
             head.header = named[-1]
-            head.units = next((c for c in fits[fits.index(named[-1]) + 1 :] if len(c) == head.columns), [])
+            below = fits[fits.index(named[-1]) + 1 :]
+            head.units = next((c for c in (*below, *units[::-1]) if len(c) == head.columns), [])
         elif fits:
             head.header = fits[-1]
     return head
@@ -321,7 +329,8 @@ def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
         notes.append(f"decimal commas are read as decimal points ({commas} lines)")
     if repeated:
         notes.append(f"repeated header ignored: {repeated} times")
-    return CsvTable(head.header, head.units, values, np.array(numbers), tuple(notes))
+    words = {head.header[k]: head.cells[k] for k in sorted(head.text) if head.header and k < len(head.cells)}
+    return CsvTable(head.header, head.units, values, np.array(numbers), tuple(notes), words)
 
 
 def _refuse_other_header(path: Path, number: int, cells: Sequence[str], head: _Head) -> None:

@@ -1,6 +1,5 @@
 """Import of measured motion from files of other tools."""
 
-import hashlib
 import logging
 import re
 from collections.abc import Mapping
@@ -24,16 +23,13 @@ from armident.daq.interchange.stated_units import in_si
 from armident.daq.interchange.table_columns import NAMES
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.table_rows import EFFORTS, TableRows, complete_rows
-from armident.daq.interchange.text_files import listed
+from armident.daq.interchange.text_files import NOTES, listed, sha256_of
 from armident.daq.recording import Field, Recording, Stream, read_recording
 from armident.daq.recording.faults.repair import REPAIRS, repair
 from armident.daq.recording.faults.sign_bit import sign_bit
 from armident.daq.recording.model import Side
 
 __all__ = ["NAMES", "OMITTED", "import_recording"]
-
-NOTES = "source_remarks"
-"""Key of the metadata with everything that an import left out or assumed."""
 
 
 # Numbers of other tools may overflow; the checks refuse what comes of them.
@@ -55,10 +51,11 @@ def import_recording(
     if isinstance(found, Recording):
         return found
     assert isinstance(config, RobotConfig)
-    facts = {"source": path.name, "source_sha256": _digest(path)}
+    files = data_files(path) or (bag_files(path)[0] if path.is_dir() else [path])
+    facts = {"source": path.name, "source_sha256": sha256_of(*files)}
     effort = options.get("effort")
     if effort is not None:
-        facts |= {"effort": effort.name, "effort_sha256": _digest(effort)}
+        facts |= {"effort": effort.name, "effort_sha256": sha256_of(effort)}
     return _from_table(config, found, options, facts)
 
 
@@ -178,7 +175,7 @@ def _repaired(
         times = rows.times / (usual * rate_hz) if usual > 0.0 else rows.row / rate_hz
     effort = next(rows.values[name] for name in EFFORTS if name in rows.values)
     q, demand, polled = rows.values["position"], rows.values.get("demand"), options.get("polled", False)
-    found = repair(q, effort, demand, times, robot, side, polled=polled)
+    found = repair(q, effort, demand, times, robot, side, polled=polled, torque="torque" in rows.values)
     if not found.notes:
         return rows, ()
     values = {**rows.values, "position": found.position}
@@ -223,7 +220,9 @@ def _check_rates(rate_hz: float | None, polled: bool, resample_hz: float | None)
 
 
 def _begin_ns(source: Source, rows: TableRows) -> int:
-    """Return the time of the first row, ns UTC, if the unit of the times has the date from which they count; else 0."""
+    """Return the time of the first row, ns UTC: of a stamp, or from the date in the unit of the times; else 0."""
+    if source.t_ns is not None:
+        return max(int(source.t_ns[rows.row[0]]), 0)
     date = source.units.get(rows.time_name, "").partition(SINCE)[2]
     try:
         start = int(np.datetime64(date.removesuffix("Z"), "ns").astype(np.int64)) if date else 0
@@ -250,16 +249,6 @@ def _recording(
     return Recording(None, robot, None, rate, streams, gaps=gaps, counters=counters, metadata=facts)
 
 
-def _digest(path: Path) -> str:
-    """Return the SHA-256 of a file, or of the files of a folder in their order."""
-    digest = hashlib.sha256()
-    for file in data_files(path) or (bag_files(path)[0] if path.is_dir() else [path]):
-        with file.open("rb") as opened:
-            while block := opened.read(1 << 20):
-                digest.update(block)
-    return digest.hexdigest()
-
-
 def resampled_recording(path: Path, robot: RobotConfig | None, options: ImportOptions) -> Recording:
     """Return a recording of armident at another sampling rate, of a configuration with the same joints."""
     rate_hz = options.get("rate_hz") or options.get("resample_hz")
@@ -273,7 +262,7 @@ def resampled_recording(path: Path, robot: RobotConfig | None, options: ImportOp
         made = at_rate(recording, rate_hz)
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
-    facts = {**made.metadata, "source": path.name, "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    facts = {**made.metadata, "source": path.name, "source_sha256": sha256_of(path)}
     return replace(made, path=None, robot=robot or recording.robot, metadata=facts)
 
 

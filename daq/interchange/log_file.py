@@ -123,15 +123,10 @@ def _check_lines(
         raise DataError(f"{path}: not a {parser.name} log: line {number} is {excerpt(line)}{hint}")
     if bad or untimed:
         frames.skipped += bad + untimed
-    if bad == 1:
+    if bad:
         number, line = malformed[0]
-        frames.notes.append(f"line {number} is not a line of a {parser.name} log and left out: {excerpt(line)}")
-    elif bad:
-        number, line = malformed[0]
-        frames.notes.append(
-            f"{bad} lines are not lines of a {parser.name} log and left out, "
-            f"the first is line {number}: {excerpt(line)}"
-        )
+        which = f"line {number} is" if bad == 1 else f"{bad} lines, the first of which is line {number}, are"
+        frames.notes.append(f"{which} not a line of a {parser.name} log and left out: {excerpt(line)}")
     if untimed:
         frames.notes.append(f"{untimed} lines without a time left out")
 

@@ -186,6 +186,14 @@ READERS = tuple(reader() for reader in Reader.__subclasses__())
 """All formats in the order of their classes; the first one that matches a file reads it."""
 
 
+_PACKED = {
+    b"PK\x03\x04": "an Excel workbook or a ZIP archive; save the sheet as CSV, or unpack the file, first",
+    b"\x1f\x8b": "compressed by gzip; unpack it first",
+    b"\x28\xb5\x2f\xfd": "compressed by zstd; unpack it first",
+}
+"""Formats by the first bytes of a file that is read as text, with the next step."""
+
+
 def reader_of(path: Path) -> Reader:
     """Return the reader of a file or folder."""
     from armident.configs import ConfigError
@@ -194,6 +202,11 @@ def reader_of(path: Path) -> Reader:
     if not is_file(path) and not path.is_dir():
         raise ConfigError(f"{path}: no such file")
     found = next((reader for reader in READERS if reader.matches(path)), None)
+    if not path.is_dir() and (found is None or isinstance(found, Csv | BusLog)):
+        with path.open("rb") as file:
+            begin = file.read(4)
+        if how := next((text for mark, text in _PACKED.items() if begin.startswith(mark)), ""):
+            raise ConfigError(f"{path}: {how}")
     if found is None:
         readable = "; ".join(f"{each.name} ({', '.join(_forms(each))})" for each in READERS)
         raise ConfigError(f"{path}: cannot read {path.suffix or 'a file without suffix'}; readable: {readable}")

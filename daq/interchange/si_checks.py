@@ -94,7 +94,10 @@ def _other_unit(name: str, kind: str, shares: NDArray[np.float64]) -> str:
     if not option or factor * shares.max() > _PLAUSIBLE:
         return ""
     unit = option.split("=")[1]
-    return f"; --units {option} if they are in {unit}; counts and {others} have to be converted where they are recorded"
+    return (
+        f"; --units {option} if they are in {unit} at all joints; counts and {others} have to be converted where they "
+        "are recorded"
+    )
 
 
 def limit_notes(
@@ -131,8 +134,8 @@ def limit_notes(
     if not passed:
         return ()
     return (
-        f"the motion passes limits, which are too small then: {', '.join(passed)}. Correct them under joints: limits "
-        "of the configuration, from which trajectories and exports take them",
+        f"the motion passes limits, which are too small if the values are in SI units: {', '.join(passed)}. Correct "
+        "them then under joints: limits of the configuration, from which trajectories and exports take them",
     )
 
 

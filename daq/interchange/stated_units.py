@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,17 +56,12 @@ def in_si(rows: TableRows, robot: RobotConfig, units: Mapping[str, str]) -> Tabl
             known = "; ".join(f"{name}={' or '.join(choices)}" for name, choices in CHOICES.items())
             raise ConfigError(f"--units: no unit {quantity}={unit}; expected {known}; position=FILE.json of LeRobot")
         factors = _factors(robot, unit)
-        concerned = _POSITIONS if quantity == "position" else (_quantity(quantity),)
+        concerned = _POSITIONS if quantity == "position" else (cast(Quantity, quantity),)
         for name in concerned:
             if name in values:
                 values[name] = values[name] * factors
         notes.append(f"{quantity} taken in {unit} (--units)")
     return replace(rows, values=values, notes=tuple(notes))
-
-
-def _quantity(name: str) -> Quantity:
-    known: dict[str, Quantity] = {"torque": "torque", "current": "current", "voltage": "voltage"}
-    return known[name]
 
 
 def _factors(robot: RobotConfig, unit: str) -> Floats:

@@ -36,8 +36,10 @@ _MEASURED = frozenset({"actual", "measured", "feedback"})
 _WORD = re.compile(r"[^\W_]+")
 _UNIT = re.compile(r"^(.*?)\s*[\[(]([^\])]*[^\])\d\s][^\])]*)[\])]$")
 """A unit in brackets; digits alone are the number of a joint."""
-_TIME_UNIT = re.compile(r"^(.*?)_(s|sec|ms|us|ns)$", re.IGNORECASE)
-_UNIT_AT_END = re.compile(r"^(.*[^\W_])[_ /](rad|mrad|deg|mm|nm|mnm|ma)$", re.IGNORECASE)
+_TIME_UNIT = re.compile(r"^(.*?)(?:_|\s*/\s*)(s|sec|ms|us|ns)$", re.IGNORECASE)
+_UNIT_AT_END = re.compile(
+    r"^(.*?[^\W_])(?:[_ ]|\s*/\s*)(rad|mrad|deg(?:rees?)?|°|mm|n ?m|n mm|n cm|mn ?m|ma)$", re.IGNORECASE
+)
 
 Table = Mapping[str, NDArray[np.float64]]
 
@@ -172,11 +174,12 @@ def _numbered(table: Table, base: str, n: int) -> TableColumns | None:
         if values.ndim != 2 or values.shape[1] != n:
             raise DataError(f"{base} has {values.shape[-1]} axes, the robot has {n}; found {listed(found)}")
         return TableColumns(values, (base,) * n if whole.ndim == 1 else tuple(f"{base}{j + 1}" for j in range(n)))
-    numbers = {}
-    for key, each in lower.items():
-        digits = re.fullmatch(re.escape(base.lower()) + r"[_.\[( ]?(\d{1,2})[\])]?", key)
-        if digits:
-            numbers[int(digits[1])] = each
+    numbers: dict[int, str] = {}
+    pattern = re.escape(base) + r"[_.\[( ]?(\d{1,2})[\])]?"
+    for flags in (re.NOFLAG, re.IGNORECASE):
+        # Names of this case first: Q1 beside q1 is another quantity.
+        if not numbers.keys() & {0, 1}:
+            numbers = {int(digits[1]): each for each in found[::-1] if (digits := re.fullmatch(pattern, each, flags))}
     if not numbers.keys() & {0, 1}:
         return None
     first = 0 if 0 in numbers else 1

@@ -28,6 +28,7 @@ class Source:
 
     ``lines`` (N,): line of each row in a text file, else ``None``. ``t_ns`` (N,): stamps of the messages of a bag, ns.
     ``clock``: sentence on the times of a bag if they are not the stamps. ``lerobot``: it is a data set of LeRobot.
+    ``words``: first text of each column of text.
     """
 
     path: Path
@@ -38,6 +39,7 @@ class Source:
     t_ns: NDArray[np.int64] | None = None
     clock: str = ""
     lerobot: bool = False
+    words: Mapping[str, str] = field(default_factory=dict)
 
     def place(self, row: int, name: str) -> str:
         """Return the position of a value in the file, for messages; rows count from 0."""
@@ -88,7 +90,7 @@ def _header_csv(path: Path) -> Source:
         raise DataError(f"{path}: several columns are named {shortened(twice[0])}")
     columns = {name: table.values[:, k] for k, name in enumerate(header) if name}
     units = [unit for name, unit in zip(header, table.units, strict=False) if name]
-    return _converted(Source(path, columns, table.lines, notes=table.notes), units)
+    return _converted(Source(path, columns, table.lines, notes=table.notes, words=table.words), units)
 
 
 def lerobot_folder(path: Path, *_: Any) -> Source:
@@ -113,7 +115,8 @@ def from_arrays(path: Path, arrays: Mapping[str, Any]) -> Source:
     if is_lerobot(arrays):
         table, notes = lerobot_table(path, arrays)
         return Source(path, table, notes=tuple(notes), lerobot=True)
-    return _converted(Source(path, _numeric(arrays)), [])
+    texts = {k: v for k, v in arrays.items() if isinstance(v, np.ndarray) and v.size and v.dtype.kind in "OU"}
+    return _converted(Source(path, _numeric(arrays), words={k: str(v.flat[0]) for k, v in texts.items()}), [])
 
 
 def _converted(source: Source, units: list[str]) -> Source:
@@ -125,12 +128,12 @@ def _converted(source: Source, units: list[str]) -> Source:
 
 
 def _numeric(arrays: Mapping[str, Any]) -> Table:
-    """Return the real arrays; vectors as (N,), and dates as seconds since the first."""
+    """Return the real arrays; vectors as (N,), and dates and durations as seconds since the first."""
     table: Table = {}
     for name, value in arrays.items():
         if not isinstance(value, np.ndarray) or not value.size:
             continue
-        if value.dtype.kind == "M":
+        if value.dtype.kind in "mM":
             table[name] = (value - value.min()) / np.timedelta64(1, "ns") * 1e-9
         elif value.dtype.kind in "iuf":
             array = value.astype(np.float64)

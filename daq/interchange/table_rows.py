@@ -1,5 +1,6 @@
 """Rows of a table: quantities of the joints, complete rows, and the numbers of their samples."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,7 +11,7 @@ from armident.configs import DataError, RobotConfig
 from armident.daq.interchange.clocks import descending, without_wraps
 from armident.daq.interchange.column_units import check_unit, time_unit
 from armident.daq.interchange.si_checks import OMITTED
-from armident.daq.interchange.table_columns import TableColumns, find_columns, find_time, unused_demand
+from armident.daq.interchange.table_columns import NAMES, TableColumns, find_columns, find_time, unused_demand
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.text_files import listed
 from armident.daq.recording.faults.zeros import never_measured
@@ -70,6 +71,8 @@ def complete_rows(
                 _check_units(source, quantity, columns.labels)
                 found[quantity] = columns
         _check_same_joints(found)
+        if not by_position:
+            _check_order(source, robot, found)
         time = None if names.get("time") == OMITTED else find_time(source.table, names.get("time"))
     except DataError as error:
         raise DataError(f"{source.path}: {error}") from error
@@ -84,6 +87,9 @@ def complete_rows(
     notes = [note for columns in found.values() for note in columns.notes]
     if "demand" not in found and names.get("demand") != OMITTED and (unused := unused_demand(source.table)):
         notes.append(unused)
+    others = [name for name in source.table if name.lower() in NAMES["time"] and time is not None and name != time[0]]
+    if time is not None and others and "time" not in names:
+        notes.append(f"times taken from {time[0]}, not from {listed(others)}; --map time=NAME chooses")
     rows = TableRows(
         {quantity: np.array(columns.values, np.float64) for quantity, columns in found.items()},
         {quantity: columns.labels for quantity, columns in found.items()},
@@ -144,6 +150,19 @@ def _check_same_joints(found: Mapping[Quantity, TableColumns]) -> None:
             raise DataError(
                 f"positions are those of {listed(position.joints)}, but {quantity}s those of {listed(effort.joints)}: "
                 "columns of several arms; name them alike, or give the names behind the last slash: --joints NAME,..."
+            )
+
+
+def _check_order(source: Source, robot: RobotConfig, found: Mapping[Quantity, TableColumns]) -> None:
+    """Refuse numbered columns of a file whose text names the joints in another order, as bags in CSV do."""
+    text = " ".join(source.words.values())
+    for names in [[joint.source_name or joint.name for joint in robot.joints], [joint.name for joint in robot.joints]]:
+        at = [place.start() for name in names if (place := re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text))]
+        if len(at) == robot.n and at != sorted(at) and any(not columns.joints for columns in found.values()):
+            order = [name for _, name in sorted(zip(at, names, strict=True))]
+            raise DataError(
+                f"columns are numbered, and {listed(list(source.words))} names the joints in another order than the "
+                f"robot: {listed(order)}; name the columns {order[0]}/position, {order[0]}/effort and so on"
             )
 
 

@@ -1,9 +1,12 @@
 """Text files of other tools: their encoding, and parts of them in messages."""
 
 import codecs
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
+NOTES = "source_remarks"
+"""Key of the metadata of a recording with everything that an import left out or assumed."""
 _HEAD = 65536
 """Bytes at the beginning of a file that decide its encoding."""
 _ZEROS_OF_UTF16 = 0.9
@@ -29,6 +32,15 @@ def encoding_of(path: Path) -> str:
     except UnicodeDecodeError:
         return "cp1252"
     return "utf-8-sig"
+
+
+def sha256_of(*files: Path) -> str:
+    """Return the SHA-256 of files, one after the other."""
+    digest = hashlib.sha256()
+    for file in files:
+        with file.open("rb") as opened:
+            hashlib.file_digest(opened, lambda: digest)
+    return digest.hexdigest()
 
 
 def excerpt(text: str) -> str:

@@ -15,6 +15,9 @@ from armident.identify.signals.periodogram import hann_window, periodogram
 BLOCK = 128
 """Independent frequencies from whose median the spectrum around a line is estimated."""
 
+ASIDE = 10.0
+"""Distance, in widths of a modulated line, of the spectrum it is compared with: sidebands raise the nearer one."""
+
 PADDING = 2
 """Number of searched frequencies per independent one."""
 
@@ -115,7 +118,7 @@ def of_references(study: Study, frequency: float) -> bool:
 
 
 def has_line(reference: Array, sample: float, frequency: float, wide: float, least: float, *, recorded: bool) -> bool:
-    """Return true if a reference (N,) has a line within ``wide``, Hz, with ``least`` times the power around it.
+    """Return true if a reference (N,) has a line within ``wide``, Hz, with ``least`` times the power beside it.
 
     Where none is recorded, the measured motion stands for it, which a vibration shakes, too: set points come once in a
     whole number of samples.
@@ -126,7 +129,8 @@ def has_line(reference: Array, sample: float, frequency: float, wide: float, lea
     if not recorded and abs(samples - round(samples)) > samples * sharp / frequency:
         return False
     near = np.abs(spectrum.f - frequency) <= max(wide, sharp)
-    return bool(np.any(spectrum.power[near] > least * spectrum.background[near]))
+    beside = np.interp([frequency - ASIDE * wide, frequency + ASIDE * wide], spectrum.f, spectrum.background)
+    return bool(np.any(spectrum.power[near] > least * beside.max()))
 
 
 def _chance(ratio: float, stretches: int) -> float:

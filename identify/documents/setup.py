@@ -64,7 +64,7 @@ class SetupDocument(SignedDocument):
         Estimated common shift of the torques, samples, with its standard deviation and those of the joints; null if it
         was not estimated.
     repairs
-        Faults of the signals that were repaired: wraps, impossible rows, drives that were off; empty if there are none.
+        Faults of the signals: wraps, impossible rows, drives that were off, positions outside limits; or empty.
     """
 
     schema_: Literal["armident/check/1"] = Field("armident/check/1", alias="schema")

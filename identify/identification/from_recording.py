@@ -25,6 +25,8 @@ MIN_PIECE_S = 0.5
 """Shortest piece between two gaps, s: edge effects of the filters cover shorter ones."""
 RATE_TOLERANCE = 0.01
 """Relative difference between the nominal rate and the receive times above which a note is added."""
+OUTSIDE = "outside its limits"
+"""Part of the note on positions that pass the limits of their joint."""
 NO_REFERENCE = "no reference trajectory was recorded: identified without one"
 """Note on a recording without demands."""
 BRIDGED = 2
@@ -358,8 +360,8 @@ def _signal_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list
         if seen[0] < low or seen[1] > high:
             unit = "rad" if joint.type == "revolute" else "m"
             notes.append(
-                f"{joint.name} was recorded over [{seen[0]:.3g}, {seen[1]:.3g}] {unit}, outside its limits "
-                f"[{low:.3g}, {high:.3g}]: wrong unit, or wrong limits?"
+                f"{joint.name} was recorded over [{seen[0]:.3g}, {seen[1]:.3g}] {unit}, {OUTSIDE} "
+                f"[{low:.3g}, {high:.3g}]: wrong unit, order of joints, or limits?"
             )
         largest = max(max(abs(float(low[j])), abs(float(high[j]))) for low, high in torques)
         if largest < NOTHING and seen[1] - seen[0] >= IdentificationCriteria.rest_limit_share * _usual_range(joint):

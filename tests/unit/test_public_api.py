@@ -102,6 +102,15 @@ def test_every_result_prints_and_writes_its_document_and_its_report(
     assert checked.findings == ()
 
 
+def test_a_check_remarks_positions_outside_their_limits(axis: armident.Identification) -> None:
+    robot = armident.load_robot("emps")
+    joint = robot.joints[0]
+    limits = joint.limits.model_copy(update={"position": (-0.01, 0.01)})
+    narrow = robot.model_copy(update={"joints": (joint.model_copy(update={"limits": limits}),)})
+    checked = armident.check(axis.recordings, narrow)
+    assert "outside its limits [-0.01, 0.01]: wrong unit, order of joints, or limits?" in str(checked)
+
+
 def test_a_model_without_parameters_says_where_they_come_from() -> None:
     with pytest.raises(ValueError, match=r"emps: .* give theta, or use result\.model"):
         armident.RobotModel("emps").mass_matrix([[0.0]])

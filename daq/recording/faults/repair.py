@@ -10,7 +10,7 @@ from armident.arrays import Array, Mask
 from armident.configs import RobotConfig
 from armident.daq.recording.faults.jumps import JumpCriteria, jumps, unwrapped
 from armident.daq.recording.faults.stale import frozen_before, frozen_efforts, repeated_efforts
-from armident.daq.recording.faults.zeros import switched_off, zero_rows
+from armident.daq.recording.faults.zeros import rows_beyond, switched_off, zero_rows
 from armident.daq.recording.model import Gap, Quantity, Recording, Side
 
 REASON = "impossible values"
@@ -55,10 +55,12 @@ def repair(
     side: Side,
     *,
     polled: bool = False,
+    torque: bool = True,
 ) -> Repair:
     """Return what of signals (N, n), SI, on one ``side`` of the gears, at times (N,), s, can be used, and why.
 
-    Rows that are missing stay for an import of ``polled`` samples, which counts them by the motion.
+    Rows that are missing stay for an import of ``polled`` samples, which counts them by the motion. The effort is a
+    ``torque``, or else a current or voltage.
     """
     criteria = JumpCriteria()
     steps = np.diff(times)
@@ -109,6 +111,12 @@ def repair(
             f"the position of {chosen} is impossible {_times(rows, at)} ({what}; no motion leads there and back): "
             "left out as gaps"
         )
+    limits_of = np.array([joint.limits.torque if torque and side == "joint" else np.inf for joint in robot.joints])
+    beyond, effort = rows_beyond(effort, limits_of, criteria)
+    for chosen, rows in _alike(beyond, names):
+        notes.append(
+            f"the torque of {chosen} is beyond its limit {_times(rows, at)}, between rows far below: left out as gaps"
+        )
     zeros: Mask = zero_rows(effort, holes, criteria)
     known = np.asarray(wrong.any(axis=1), dtype=np.bool_)
     elsewhere = np.asarray(zeros & ~known[:, None], dtype=np.bool_)
@@ -121,7 +129,7 @@ def repair(
     if copied.any():
         rows = np.flatnonzero(copied)
         notes.append(f"the torques repeat earlier ones, value by value, {_times(rows, at)}: left out as gaps")
-    out = np.asarray((wrong | zeros | stale | kept).any(axis=1) | copied, dtype=np.bool_)
+    out = np.asarray((wrong | zeros | stale | kept | beyond).any(axis=1) | copied, dtype=np.bool_)
     off = np.zeros(times.size, dtype=np.bool_)
     for begin, end in switched_off(effort, dt, criteria):
         off[begin:end] = True
@@ -172,7 +180,8 @@ def repaired(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     demand = samples.named("demand")
     qr = samples.si(demand) if own and demand is not None else None
     times = samples.sync / recording.sample_rate_hz
-    found = repair(q, tau, qr, times, robot, samples.fields[position].side)
+    torque = samples.named("torque") is not None
+    found = repair(q, tau, qr, times, robot, samples.fields[position].side, torque=torque)
     if not found.notes:
         return recording, before
     raw = dict(samples.raw)

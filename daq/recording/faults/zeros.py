@@ -1,4 +1,4 @@
-"""Efforts that are no measurement: zero in every row, or in rows between others that are not."""
+"""Efforts that are no measurement: zero in every row, or 0 or beyond the limit in rows between others that are not."""
 
 import numpy as np
 
@@ -8,6 +8,8 @@ from armident.daq.recording.faults.jumps import JumpCriteria
 NOTHING = 1e-300
 """Magnitude below which an effort is 0 in every unit: memory that was never written holds such numbers."""
 
+FAR_BEYOND = 3.0
+"""Effort over the usual ones (95 % quantile) from which one beyond the limit is no peak of a motion."""
 
 LEAST_OFF_S = 0.1
 """Shortest time, s, for which drives are off."""
@@ -36,6 +38,17 @@ def zero_rows(effort: Array, holes: Mask, criteria: JumpCriteria) -> Mask:
         for begin, end in runs(together):
             found[begin:end, used] |= end - begin <= criteria.longest
     return found | far
+
+
+def rows_beyond(effort: Array, strongest: Array, criteria: JumpCriteria) -> tuple[Mask, Array]:
+    """Mask (N, n) of efforts beyond their limits (n,) and all others in few rows, and efforts with the rows before."""
+    size = np.abs(effort)
+    beyond = size > np.maximum(strongest, FAR_BEYOND * np.quantile(size, criteria.most, axis=0))
+    for j in np.flatnonzero(beyond.any(axis=0)):
+        for begin, end in runs(beyond[:, j]):
+            beyond[begin:end, j] = end - begin <= criteria.longest
+    before = np.maximum.accumulate(np.where(beyond, 0, np.arange(len(effort))[:, None]), axis=0)
+    return beyond, np.take_along_axis(effort, before, axis=0)
 
 
 def switched_off(effort: Array, dt: float, criteria: JumpCriteria) -> list[tuple[int, int]]:

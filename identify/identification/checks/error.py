@@ -44,7 +44,8 @@ def error(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     reasons = []
     if wrong and step == CHECK and (ls_errors[wrong] <= limits[wrong]).all():
         better = f"; idim-ls leaves {ls_errors[wrong].max():.3g} % at most"
-        reasons.append(reason("unusable", wrong, better, "use --method idim-ls, or record the reference"))
+        reference = "" if all(e.q_ref is not None for e in judged.prepared.experiments) else ", or record the reference"
+        reasons.append(reason("unusable", wrong, better, f"use --method idim-ls{reference}"))
     elif wrong:
         reasons.append(reason("unusable", wrong, ""))
     if noisy:

@@ -112,6 +112,23 @@ def test_torques_of_zero_between_others_are_left_out(tx40: RobotConfig, joint: i
     assert len(result.notes) == 1
 
 
+@pytest.mark.parametrize("value", [300.0, -9999.0, 65535.0])
+def test_values_of_a_sensor_that_fails_are_left_out(tx40: RobotConfig, value: float) -> None:
+    rng = np.random.default_rng(4)
+    t, q, tau = motion(rng, 500.0)
+    tau = np.round(tau, 0)  # coarse steps are flat, and are no frozen torque for the sake of a spike
+    rows = np.sort(rng.choice(np.arange(5, t.size - 5), 6, replace=False))
+    spiked = tau.copy()
+    spiked[rows, 3] = value
+    result = found(t, q, spiked, tx40)
+    assert np.flatnonzero(result.wrong).tolist() == rows.tolist()
+    assert "joint_4 is beyond its limit in 6 rows" in result.notes[0]
+    lasting = tau.copy()
+    lasting[1000:1011, 3] = value  # eleven rows are no spike
+    others = found(t, q, lasting, tx40), repair(q, spiked, None, t, tx40, "motor")  # limits are those of joints
+    assert not any("beyond" in note for result in others for note in result.notes)
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_signals_that_are_not_renewed_are_left_out_while_they_are(tx40: RobotConfig, seed: int) -> None:
     rng = np.random.default_rng(seed)

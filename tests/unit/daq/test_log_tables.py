@@ -70,6 +70,14 @@ def test_a_bus_log_in_csv_is_read_by_the_names_of_its_columns(tmp_path: Path, fo
     assert "source_remarks" not in found.metadata
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("us", 1e6)])
+def test_times_without_their_unit_are_named(tmp_path: Path, unit: str, factor: float) -> None:
+    rows = [f"{since(m) * factor:.9g},{m.arbitration_id:x},{m.data.hex()}" for m in messages()]
+    with pytest.raises(DataError, match=rf"times in {unit} fit SYNC every .*: name their column 'time \[{unit}\]'"):
+        import_recording(table(tmp_path / "a.csv", "time,id,data", rows), SESSION)
+    assert same(import_recording(table(tmp_path / "b.csv", f"time [{unit}],id,data", rows), SESSION))
+
+
 def test_the_csv_of_python_can_is_read(tmp_path: Path) -> None:
     with can.CSVWriter(tmp_path / "a.csv") as writer:
         for message in messages():

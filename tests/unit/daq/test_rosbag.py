@@ -127,6 +127,14 @@ def test_messages_of_a_gripper_and_of_another_arm_are_passed_over(tmp_path: Path
     assert f"{ROWS + len(fingers)} messages of other joints ignored: left, right, right_joint_1" in remark
 
 
+def test_a_recording_of_a_bag_and_its_exports_have_the_date_of_the_stamps(tmp_path: Path) -> None:
+    recording = import_recording(mcap_bag(tmp_path / "a.mcap", states()), TX40)
+    assert recording.samples.t_ns[0] == T0
+    export_recording(recording, tmp_path / "a.csv")
+    assert "t [s since 2023-11-14T22:13:20" in (tmp_path / "a.csv").read_text().splitlines()[0]
+    assert import_recording(tmp_path / "a.csv", TX40).samples.t_ns[0] == T0
+
+
 def test_two_sources_that_alternate_on_one_topic_are_said(tmp_path: Path) -> None:
     other = [replace(m, at=m.at + STEP_NS // 2, q=np.asarray(m.q) + 0.5) for m in states()]
     recording = import_recording(mcap_bag(tmp_path / "a.mcap", [*states(), *other]), TX40)

@@ -247,3 +247,36 @@ def test_a_unit_of_times_is_advised_only_if_no_other_is_plausible(tmp_path: Path
         DataError, match=r"in ms it would be 50 Hz and in us it would be 50000 Hz: state the unit with --time-unit$"
     ):
         import_recording(written(tmp_path / "a.csv", values), TX40)
+
+
+@pytest.mark.parametrize(("unit", "seconds"), [("min", 60.0), ("h", 3600.0), ("days", 86400.0)])
+def test_times_in_longer_units_than_seconds_are_refused(tmp_path: Path, unit: str, seconds: float) -> None:
+    values = motion()
+    values[:, 0] /= seconds
+    with pytest.raises(DataError, match=rf"in {unit} it would be 1000 Hz: convert the times to s"):
+        import_recording(written(tmp_path / "a.csv", values, cell="{:.16g}"), TX40)
+
+
+def test_a_column_that_counts_samples_is_not_only_taken_for_milliseconds(tmp_path: Path) -> None:
+    values = motion(rate=500.0)
+    values[:, 0] = np.arange(len(values))
+    path = written(tmp_path / "a.csv", values)
+    with pytest.raises(DataError, match=r"--time-unit ms .*counts samples, omit it with --map time=- and give their"):
+        import_recording(path, TX40)
+    found = import_recording(path, TX40, names={"time": "-"}, rate_hz=500.0)
+    assert found.sample_rate_hz == 500.0
+
+
+def test_two_columns_of_times_are_named(tmp_path: Path) -> None:
+    values = motion()
+    path = written(tmp_path / "a.csv", np.column_stack([values[:, 0] * 2.0, values]), ["timestamp", *NAMES])
+    found = import_recording(path, TX40)
+    assert found.sample_rate_hz == pytest.approx(1000.0)
+    assert "times taken from t, not from timestamp; --map time=NAME chooses" in found.metadata["source_remarks"]
+
+
+def test_durations_are_times(tmp_path: Path) -> None:
+    values = motion()
+    times = (values[:, 0] * 1e9).round().astype("m8[ns]")
+    np.savez(tmp_path / "a.npz", t=times, q=values[:, 1 : N + 1], tau=values[:, N + 1 :])
+    assert import_recording(tmp_path / "a.npz", TX40).sample_rate_hz == pytest.approx(1000.0)

@@ -167,3 +167,14 @@ def test_a_line_of_measured_motion_is_one_of_set_points_only_at_their_rate(frequ
 def test_a_series_shorter_than_the_window_about_a_reversal_keeps_its_length() -> None:
     (away,) = away_from_reversals([np.ones(6)], [np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])], 0.1)
     np.testing.assert_array_equal(away, [0.0 if abs(k - 5) <= 4 else 1.0 for k in range(6)])
+
+
+def test_sidebands_of_set_points_do_not_hide_their_line() -> None:
+    sample, rng = 1.0 / 500.0, np.random.default_rng(1)
+    t = sample * np.arange(9000)
+    knots = np.arange(0.0, t[-1] + 0.02, 0.01)
+    waves = rng.uniform(0.1, 8.0, 40)[:, None] * knots + rng.uniform(0.0, 6.0, 40)[:, None]
+    reference = np.interp(t, knots, np.sin(2.0 * np.pi * waves).sum(axis=0))
+    assert has_line(reference, sample, 99.5, 1.0, 100.0, recorded=True)
+    for frequency in (33.0, 61.3, 150.0):
+        assert not has_line(reference, sample, frequency, 1.0, 100.0, recorded=True)
