@@ -194,11 +194,8 @@ def _numbered(table: Table, base: str, n: int) -> TableColumns | None:
         raise DataError(f"has a column {numbers[first + n]}, but the robot has {n} joints; found {listed(found)}")
     if any(table[label].ndim != 1 for label in labels):
         raise DataError(f"{labels[0]} has {table[labels[0]].ndim} dimensions, expected a column")
-    note = (f"columns are counted from 0: {labels[0]} is {_FIRST}",) if first == 0 else ()
+    note = ("columns are counted from 0, which is the first joint",) if first == 0 else ()
     return TableColumns(_side_by_side(table, labels), tuple(labels), note)
-
-
-_FIRST = "the first joint"
 
 
 def _by_joint(

@@ -71,6 +71,16 @@ def test_the_log_of_libfranka_has_measured_and_desired_positions(tmp_path: Path)
     found = import_recording(written(tmp_path / "a.csv", np.hstack(columns), names), TX40, time_unit="ms")
     assert same(found, values)
     assert np.allclose(found.samples.raw["demand"], kinds["state.q_d"], rtol=0, atol=1e-8)
+    assert found.metadata["source_remarks"].count("counted from 0") == 1
+
+
+def test_a_name_that_two_columns_have_is_refused_only_where_it_is_needed(tmp_path: Path) -> None:
+    older = ["duration", *(f" {kind}[{j}]" for kind in ("q", "tau_J", "dq_d", "dq_d") for j in range(N))]
+    values = np.hstack([motion(), np.ones((400, 2 * N))])
+    assert same(import_recording(written(tmp_path / "a.csv", values, older), TX40), motion())
+    path = written(tmp_path / "b.csv", motion(), ["t", "q1", *NAMES[1:6], *NAMES[7:]])
+    with pytest.raises(DataError, match=r"expected columns q1\.\.q6 .*found t, q1 in 2 columns, q2"):
+        import_recording(path, TX40)
 
 
 def test_a_missing_column_lists_what_was_found(tmp_path: Path) -> None:
