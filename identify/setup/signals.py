@@ -221,8 +221,11 @@ def clipped_findings(
             if share >= CLIPPED_SHARE:
                 unit = "N m" if robot.joints[j].type == "revolute" else "N"
                 message = f"the torque of {name} is clipped at {level:.4g} {unit} in {100 * share:.1f} % of the samples"
-                unusable = share >= CLIPPED_UNUSABLE
-                findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, CLIPPED_REMEDY, unusable))
+                unusable, remedy = share >= CLIPPED_UNUSABLE, CLIPPED_REMEDY
+                if level == 0.0:
+                    message = f"the torque of {name} is 0 in {100 * share:.1f} % of the samples although the joint moves"
+                    remedy = "record a faster motion, or the torque in finer steps; check that it has both signs"
+                findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, remedy, unusable))
                 break
     return findings
 

@@ -124,7 +124,7 @@ def empty_debian(root: Path) -> Path:
     run(
         "debootstrap",
         "--variant=minbase",
-        "--include=python3-venv,ca-certificates",
+        "--include=python3-venv,ca-certificates,libgomp1",  # libgomp1: for Pinocchio
         "bookworm",
         str(root),
         cwd=root.parent,
