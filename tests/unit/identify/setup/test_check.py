@@ -12,7 +12,7 @@ from armident.identify.setup.bench import make_bench
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.describe import as_configured
 from armident.identify.setup.search import Search, Step
-from armident.identify.setup.signals import one_way_findings
+from armident.identify.setup.signals import clipped_findings, one_way_findings
 from armident.identify.signals.experiments import Experiment
 from tests.fixtures import setups
 from tests.fixtures.arms import FAST, checked, recording
@@ -341,6 +341,17 @@ def test_clipped_torques_are_named(healthy: list[Experiment], arm: RobotConfig) 
     clipped = [replace(e, tau=np.clip(e.tau, [-1e9, -level, -1e9], [1e9, level, 1e9])) for e in healthy]
     found = check_setup(clipped, arm)
     assert [(f.kind, f.joints) for f in found.findings] == [("torque_clipped", ("axis_2",))]
+
+
+def test_a_torque_below_the_steps_of_its_signal_is_not_called_clipped(
+    healthy: list[Experiment], arm: RobotConfig
+) -> None:
+    step = 0.9 * np.abs(healthy[0].tau[:, 1]).max()
+    coarse = [replace(e, tau=np.where([False, True, False], step * (e.tau > step), e.tau)) for e in healthy]
+    (finding,) = clipped_findings(coarse, arm, np.ones(3, dtype=np.bool_))
+    assert (finding.joints, finding.decisive) == (("axis_2",), True)
+    assert "of axis_2 is 0 in" in finding.message
+    assert "finer steps" in finding.remedy
 
 
 @pytest.mark.slow
