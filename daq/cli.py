@@ -106,7 +106,7 @@ def _reported(function: Callable[..., Any], name: str) -> Callable[..., Any]:
         except Exception as error:
             from armident.configs.errors import ArmidentError, ConfigError
             from armident.configs.reasons import reason_of
-            from armident.extras import install_line, needed_extra
+            from armident.extras import install_line, missing_library, needed_extra
 
             if interrupts:
                 # A compiler or a callback in C can turn the interrupt into another error.
@@ -115,6 +115,9 @@ def _reported(function: Callable[..., Any], name: str) -> Callable[..., Any]:
                 traceback.print_exc()
             if isinstance(error, ImportError) and (extra := needed_extra(error, function.__module__)) is not None:
                 print(f"armident: {install_line(f'armident {name}', [extra])}", file=sys.stderr)
+                raise typer.Exit(ConfigError.exit_code) from None
+            if isinstance(error, ImportError) and (line := missing_library(error)) is not None:
+                print(f"armident: {line}", file=sys.stderr)
                 raise typer.Exit(ConfigError.exit_code) from None
             if isinstance(error, ArmidentError):
                 print(f"armident: {_one_line(error)}", file=sys.stderr)

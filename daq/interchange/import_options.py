@@ -46,7 +46,7 @@ class ImportOptions(TypedDict, total=False):
             "--map",
             parser=pairs,
             metavar="QUANTITY=NAME,...",
-            help="Names in the file: position=qm,voltage=vir,...; demand=- omits it.",
+            help="Names in the file: position=qm,voltage=vir,...; a word beside joint names too; demand=- omits it.",
         ),
     ]
     polled: Annotated[

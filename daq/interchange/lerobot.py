@@ -30,8 +30,8 @@ _COUNTS = 4096
 """Counts per turn of the servos of LeRobot's arms (STS3215, XL330, XL430)."""
 _MOST = 1 << 31
 """Counts that no range reaches."""
-_BETWEEN_S = 1.0
-"""Gap between two episodes, s: the time between them is not recorded."""
+_BETWEEN = 6
+"""Periods from an episode to the next: a gap at every rate. Many short episodes do not count as lost samples."""
 _SUFFIX = re.compile(r"[._](pos|position|goal|eff|effort|torque|tau|current)$", re.IGNORECASE)
 """End of a name that tells the quantity, not the joint."""
 
@@ -153,11 +153,9 @@ def _one_clock(times: NDArray[np.float64], episode: NDArray[np.float64], notes: 
     step = float(np.median(np.diff(times)))
     made = times.copy()
     for begin in begins:
-        # Whole periods, so that the gap is one.
-        between = max(1.0, round(_BETWEEN_S / step)) * step if step > 0 else _BETWEEN_S
-        made[begin:] += made[begin - 1] + between - made[begin]
+        made[begin:] += made[begin - 1] + _BETWEEN * step - made[begin]
     if begins.size:
-        notes.append(f"{begins.size + 1} episodes one after the other, with a gap of {_BETWEEN_S:g} s between them")
+        notes.append(f"{begins.size + 1} episodes one after the other, the time between them is not known")
     return made
 
 

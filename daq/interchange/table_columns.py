@@ -1,7 +1,7 @@
 """Columns of a table by quantity and joint: ``q1``, ``q0``, names of joints, and units in names."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,19 +14,19 @@ from armident.daq.interchange.joint_names import match_joints
 from armident.daq.interchange.text_files import listed, shortened
 
 NAMES: Mapping[str, tuple[str, ...]] = {
-    "time": ("t", "time", "times", "timestamp", "timestamps", "__time", "stamp", "elapsed"),
-    "position": ("q", "qm", "position", "positions", "actual_q"),
-    "torque": ("tau", "torque", "torques", "effort", "efforts", "actual_current_as_torque"),
+    "time": ("t", "time", "times", "timestamp", "timestamps", "__time", "stamp", "elapsed", "duration"),
+    "position": ("q", "qm", "position", "positions", "actual_q", "state.q"),
+    "torque": ("tau", "torque", "torques", "effort", "efforts", "actual_current_as_torque", "tau_J", "state.tau_J"),
     "current": ("current", "currents", "actual_current"),
     "voltage": ("voltage", "vir"),
-    "demand": ("qr", "qg"),
+    "demand": ("qr", "qg", "state.q_d"),
 }
 """Accepted names of each quantity; ``q`` also stands for columns ``q1..qn`` and ``q0..q(n-1)``. A demand is also a
 position with a word for a demand in its name (`armident.daq.interchange.demand_names`)."""
 
 _WORDS: Mapping[str, frozenset[str]] = {
     "position": frozenset({"position", "positions", "pos", "q"}),
-    "torque": frozenset({"effort", "efforts", "eff", "torque", "torques", "tau"}),
+    "torque": frozenset({"effort", "efforts", "eff", "torque", "torques", "trq", "tau"}),
     "current": frozenset({"current", "currents"}),
     "voltage": frozenset({"voltage", "voltages"}),
 }
@@ -85,7 +85,7 @@ def without_units(
 def find_time(table: Table, name: str | None = None) -> tuple[str, NDArray[np.float64]] | None:
     """Return name and values (N,) of the column of times, or ``None``; ``name``: stated by the user."""
     if name is not None and name not in table:
-        raise DataError(f"no array named {name!r}; found {listed(list(table))}")
+        raise DataError(f"no column named {name!r}; found {listed(list(table))}")
     lower = {each.lower(): each for each in reversed(list(table))}
     for base in (name,) if name is not None else NAMES["time"]:
         found = base if base in table else lower.get(base.lower())
@@ -106,16 +106,22 @@ def find_columns(
     by_position: bool = False,
     joints: Sequence[str] | None = None,
 ) -> TableColumns | None:
-    """Return the columns of a quantity in the robot's order, or ``None``; ``name``: stated by the user."""
+    """Return the columns of a quantity in the robot's order, or ``None``; ``name``: stated by the user.
+
+    That is an array, the beginning of numbered columns, or the word beside the names of joints.
+    """
     for base in (name,) if name is not None else NAMES[quantity]:
         found = _numbered(table, base, robot.n)
         if found is not None:
             return found
     if name is not None:
-        raise DataError(f"no array named {name!r}; found {listed(list(table))}")
+        found = _by_joint(table, frozenset({name.lower()}), robot, by_position, joints)
+        if found is None:
+            raise DataError(f"no column named {name!r}; found {listed(list(table))}")
+        return found
     if quantity == "demand":
         return _demand(table, robot, by_position, joints)
-    return _by_joint(table, quantity, robot, by_position, joints)
+    return _by_joint(table, _WORDS.get(quantity, frozenset()), robot, by_position, joints)
 
 
 def unused_demand(table: Table) -> str:
@@ -150,7 +156,7 @@ def _demand(table: Table, robot: RobotConfig, by_position: bool, joints: Sequenc
         except DataError:
             continue
     try:
-        found = found or _by_joint(positions, "position", robot, by_position, joints)
+        found = found or _by_joint(positions, _WORDS["position"], robot, by_position, joints)
         columns = [rest for rest, values in positions.items() if values.ndim == 1]
         if found is None and columns:
             match = match_joints(columns, robot.joints, joints=joints)
@@ -191,17 +197,14 @@ def _numbered(table: Table, base: str, n: int) -> TableColumns | None:
         raise DataError(f"has a column {numbers[first + n]}, but the robot has {n} joints; found {listed(found)}")
     if any(table[label].ndim != 1 for label in labels):
         raise DataError(f"{labels[0]} has {table[labels[0]].ndim} dimensions, expected a column")
-    note = (f"columns are counted from 0: {labels[0]} is {_FIRST}",) if first == 0 else ()
+    note = ("columns are counted from 0, which is the first joint",) if first == 0 else ()
     return TableColumns(_side_by_side(table, labels), tuple(labels), note)
 
 
-_FIRST = "the first joint"
-
-
 def _by_joint(
-    table: Table, quantity: str, robot: RobotConfig, by_position: bool, joints: Sequence[str] | None
+    table: Table, quantity: Set[str], robot: RobotConfig, by_position: bool, joints: Sequence[str] | None
 ) -> TableColumns | None:
-    """Return the columns that are named after joints and quantity, such as ``/joint_states/elbow/position``."""
+    """Return the columns that are named after joints and a word of the quantity: ``/joint_states/elbow/position``."""
     of_joint: dict[str, str] = {}
     for name, values in table.items():
         rest = _joint_of(name, quantity)
@@ -219,15 +222,15 @@ def _by_joint(
     return TableColumns(_side_by_side(table, labels), labels, match.remarks, match.names)
 
 
-def _joint_of(name: str, quantity: str) -> str | None:
-    """Return the part of a column's name that tells its joint, if the column is of a quantity and no demand."""
+def _joint_of(name: str, quantity: Set[str]) -> str | None:
+    """Return the part of a column's name that tells its joint, if it has a word of a quantity and none of a demand."""
     words = [(found[0].lower(), found.start(), found.end()) for found in _WORD.finditer(name)]
-    if len(words) < 2 or quantity not in _WORDS or without_demand(name) is not None:
+    if len(words) < 2 or without_demand(name) is not None:
         return None
-    if words[-1][0] in _WORDS[quantity]:
+    if words[-1][0] in quantity:
         end = words[-2][1] if words[-2][0] in _MEASURED and len(words) > 2 else words[-1][1]
         return name[:end].strip(" ./_-:[]")
-    if words[0][0] in _WORDS[quantity]:
+    if words[0][0] in quantity:
         return name[words[0][2] :].strip(" ./_-:[]")
     return None
 

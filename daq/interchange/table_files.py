@@ -1,5 +1,6 @@
 """Named arrays of the files of other tools."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -85,11 +86,11 @@ def _header_csv(path: Path) -> Source:
     if table.header is None:
         raise DataError(f"{path}: no header line; expected t,q1..,tau1.. (or a pair of files with --effort)")
     header = [printable(name) for name in table.header]
-    twice = sorted({name for name in header if name and header.count(name) > 1})
-    if twice:
-        raise DataError(f"{path}: several columns are named {shortened(twice[0])}")
-    columns = {name: table.values[:, k] for k, name in enumerate(header) if name}
-    units = [unit for name, unit in zip(header, table.units, strict=False) if name]
+    count = Counter(header)
+    # a name that several columns have is that of none
+    kept = {name if n == 1 else f"{name} in {n} columns": header.index(name) for name, n in count.items() if name}
+    columns = {name: table.values[:, k] for name, k in kept.items()}
+    units = [table.units[k] for k in kept.values() if k < len(table.units)]
     return _converted(Source(path, columns, table.lines, notes=table.notes, words=table.words), units)
 
 

@@ -220,11 +220,15 @@ def clipped_findings(
                 findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, remedy, True))
                 break
             share, level = _clipped(torques, [e.q[:, j] for e in experiments])
-            if share >= CLIPPED_SHARE and in_fine_steps(torques):
+            if share >= CLIPPED_SHARE and (level == 0.0 or in_fine_steps(torques)):
                 unit = "N m" if robot.joints[j].type == "revolute" else "N"
-                message = f"the torque of {name} is clipped at {level:.4g} {unit} in {100 * share:.1f} % of the samples"
-                unusable = share >= CLIPPED_UNUSABLE
-                findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, CLIPPED_REMEDY, unusable))
+                of = f"in {100 * share:.1f} % of the samples"
+                message = f"the torque of {name} is clipped at {level:.4g} {unit} {of}"
+                unusable, remedy = share >= CLIPPED_UNUSABLE, CLIPPED_REMEDY
+                if level == 0.0:
+                    message = f"the torque of {name} is 0 {of} although the joint moves"
+                    remedy = "record a faster motion, or the torque in finer steps; check that it has both signs"
+                findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, remedy, unusable))
                 break
     return findings
 

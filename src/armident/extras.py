@@ -29,6 +29,13 @@ def needed_extra(error: ImportError, package: str = "") -> str | None:
     return found[0] if found else None
 
 
+def missing_library(error: ImportError) -> str | None:
+    """Return the line that names the library of the system that an import lacks, and its package; else ``None``."""
+    name, found, _ = str(error).partition(": cannot open shared object file")
+    package = name.replace(".so.", "").lower()
+    return f"{name} is missing on this system (Debian, Ubuntu: apt-get install {package})" if found else None
+
+
 def install_line(what: str, extras: Iterable[str]) -> str:
     """Return the line that names the missing extras of ``what`` and the command that installs them."""
     return f"{what} needs extra packages: pip install 'armident[{','.join(extras)}]'"

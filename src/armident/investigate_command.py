@@ -106,7 +106,7 @@ def investigate(
         former = None if resume is None else load_document(resume / "investigation.json", InvestigationDocument)
         most = experiments if former is None else former.experiments - len(former.rounds)
         left_s = 60.0 * minutes if former is None else 60.0 * former.minutes - former.motion_s
-        print(f"investigate: at most {most} more motions of {left_s:.0f} s together", file=sys.stderr)
+        print(f"investigate: motions to come: at most {most}, of {left_s:.0f} s in total", file=sys.stderr)
     with bars:
         found = run(
             config, asked, read, choose_from=offered, baseline=baseline, experiments=experiments, minutes=minutes,

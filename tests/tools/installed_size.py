@@ -1,18 +1,21 @@
 """Measures what an installation brings: time, packages and megabytes of each set of extras, in clean environments.
 
+Each one is used as a new user would: help, an example, an import, an identification, a virtual arm.
+
 ``python -m tests.tools.installed_size`` builds a wheel of the checkout and installs it by pip, so it needs network.
 ``--python`` takes another Python. ``--debian`` installs in an empty Debian 12 instead (debootstrap, as root).
 ``--demo`` also runs the demo from the wheel with all extras, in a folder of its own.
 """
 
 import argparse
+import math
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -32,23 +35,23 @@ def main(arguments: Sequence[str]) -> None:
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        wheel = options.wheel or build(options.python, folder / "wheel")
+        wheel = options.wheel.resolve() if options.wheel else build(options.python, folder / "wheel")
         root = empty_debian(folder / "debian") if options.debian else None
         if root is not None:
             shutil.copy(wheel, root)
             wheel = Path("/", wheel.name)
         for number, extras in enumerate(options.extras):
-            begin = time.monotonic()
-            requirement = f"{wheel}[{extras}]" if extras else str(wheel)
-            if root is None:
-                packages = install(options.python, folder / str(number), requirement)
-            else:
-                packages = install_in(root, f"/{number}", requirement)
-            seconds = time.monotonic() - begin
-            print(f"armident[{extras}]: {seconds:.0f} s, {size(packages)}", flush=True)
+            system = System(root or Path("/"), f"/{number}" if root else str(folder / str(number)))
+            before = os.times()
+            system.install("python3" if root else options.python, f"{wheel}[{extras}]" if extras else str(wheel))
+            after = os.times()
+            took = f"{after.elapsed - before.elapsed:.0f} s, {after.children_user - before.children_user:.0f} s of CPU"
+            print(f"armident[{extras}]: {took}, {size(system.packages)}", flush=True)
+            system.use(extras)
         if options.demo:
-            install(options.python, folder / "demo", f"{wheel}[identify,virtual]")
-            run(str(folder / "demo/bin/armident"), "demo", "--out", str(folder / "out"), cwd=folder)
+            system = System(Path("/"), str(folder / "demo"))
+            system.install(options.python, f"{wheel}[identify,virtual]")
+            system.run(f"{system.folder}/bin/armident", "demo", "--out", str(folder / "out"))
 
 
 def build(python: str, folder: Path) -> Path:
@@ -58,15 +61,62 @@ def build(python: str, folder: Path) -> Path:
     return wheel
 
 
-def install(python: str, folder: Path, requirement: str) -> Path:
-    """Install a wheel into a new environment and return its site-packages.
+@dataclass(frozen=True)
+class System:
+    """A folder with an environment of Python.
 
-    ``requirement``: the wheel, with extras in brackets.
+    ``root``: root folder of its system; ``folder``: absolute path there.
     """
-    run(python, "-m", "venv", str(folder), cwd=folder.parent)
-    run(str(folder / "bin/python"), "-m", "pip", "install", "-q", requirement, cwd=folder)
-    (packages,) = (folder / "lib").glob("python3*/site-packages")
-    return packages
+
+    root: Path
+    folder: str
+
+    @property
+    def outside(self) -> Path:
+        """The folder on this machine."""
+        return self.root / self.folder.lstrip("/")
+
+    @property
+    def packages(self) -> Path:
+        """Folder site-packages of the environment on this machine."""
+        (packages,) = (self.outside / "lib").glob("python3*/site-packages")
+        return packages
+
+    def run(self, *command: str) -> None:
+        """Run a command of the system in the folder."""
+        inside = () if self.root == Path("/") else ("chroot", str(self.root))
+        run(*inside, "env", f"--chdir={self.folder}", *command, cwd=self.root)
+
+    def install(self, python: str, requirement: str) -> None:
+        """Install a wheel into a new environment of ``python``; the requirement has its extras in brackets."""
+        self.outside.mkdir()
+        self.run(python, "-m", "venv", ".")
+        self.run("bin/python", "-m", "pip", "install", "-q", requirement)
+
+    def use(self, extras: str) -> None:
+        """Run what a new user runs, as far as the extras go: a table of an axis, its model, a virtual arm."""
+        self.run("bin/armident", "--help")
+        self.run("bin/armident", "example", "integration_test")
+        (self.outside / "axis.csv").write_text(table_of_an_axis(), encoding="utf-8")
+        self.run("bin/armident", "import", "axis.csv", "--config", "emps.yaml", "--out", "axis.mcap")
+        self.run("bin/armident", "export", "axis.mcap", "--out", "again.csv")
+        if extras:
+            self.run("bin/armident", "identify", "axis.mcap", "--out", "model")
+        if "virtual" in extras or extras == "all":
+            config = "integration_test/picker.yaml"
+            self.run("bin/armident", "robot", "--config", config, "--to-file", "picker.mcap")
+            self.run("bin/armident", "check", "picker.mcap")
+
+
+def table_of_an_axis() -> str:
+    """Return the table of a linear axis of 95 kg with friction, 4 s at 1 kHz."""
+    rows = ["t,q1,tau1"]
+    for step in range(4000):
+        t = step * 1e-3
+        waves = [(0.04, 3.0), (0.015, 7.0), (0.004, 17.0)]
+        q, qd, qdd = (sum(a * w**k * math.sin(w * t + k * math.pi / 2) for a, w in waves) for k in range(3))
+        rows.append(f"{t:.3f},{q:.9f},{95 * qdd + 200 * qd + 20 * math.tanh(1e3 * qd):.6f}")
+    return "\n".join(rows)
 
 
 def empty_debian(root: Path) -> Path:
@@ -74,7 +124,7 @@ def empty_debian(root: Path) -> Path:
     run(
         "debootstrap",
         "--variant=minbase",
-        "--include=python3-venv,ca-certificates",
+        "--include=python3-venv,ca-certificates,libgomp1",  # libgomp1: for Pinocchio
         "bookworm",
         str(root),
         cwd=root.parent,
@@ -82,16 +132,6 @@ def empty_debian(root: Path) -> Path:
     for file in ("/etc/resolv.conf", "/etc/ssl/certs/ca-certificates.crt"):
         shutil.copy(file, root / file.lstrip("/"))
     return root
-
-
-def install_in(root: Path, folder: str, requirement: str) -> Path:
-    """Install into a new environment of another system, run ``armident --version`` there, return its site-packages."""
-    inside = ("chroot", str(root))
-    run(*inside, "python3", "-m", "venv", folder, cwd=root)
-    run(*inside, f"{folder}/bin/python", "-m", "pip", "install", "-q", requirement, cwd=root)
-    run(*inside, f"{folder}/bin/armident", "--version", cwd=root)
-    (packages,) = Path(root, folder.lstrip("/"), "lib").glob("python3*/site-packages")
-    return packages
 
 
 def size(packages: Path) -> str:

@@ -2,18 +2,21 @@
 
 ``armident demo --out demo > demo.log; python -m tests.tools.terminal_recording demo.log docs/images/terminal.svg``
 
-Lines appear at the times that stand in them, ``SPEED`` times as fast. Working directory and repeated progress are left
-out. Whoever asks the browser for less motion sees the last lines at once.
+Lines appear at the times that stand in them, ``SPEED`` times as fast, and one after the other. Working directory and
+repeated progress are left out. Whoever asks the browser for less motion sees the last lines at once.
 """
 
 import argparse
 import re
 from collections.abc import Iterator, Sequence
 from html import escape
+from itertools import accumulate
 from pathlib import Path
 
 SPEED = 10.0
 """Seconds of the demo in one second of the picture."""
+STEP_S = 0.12
+"""Least time between two lines, s: a table runs past instead of jumping over what does not fit."""
 READING_S = 8.0
 """Time for which the end stands, s."""
 COLUMNS, ROWS, LINE_PX, LETTER_PX = 112, 26, 18, 7.8
@@ -37,10 +40,11 @@ def lines_of(log: str, folder: str) -> Iterator[tuple[float, str]]:
 
 def picture(lines: Sequence[tuple[float, str]]) -> str:
     """Return the SVG of lines with their times, s."""
-    total = lines[-1][0] / SPEED + READING_S
+    shown = list(accumulate((time / SPEED for time, _ in lines), lambda before, time: max(before + STEP_S, time)))
+    total = shown[-1] + READING_S
     width, height = round(COLUMNS * LETTER_PX) + 24, ROWS * LINE_PX + 20
     over = max(len(lines) - ROWS, 0) * LINE_PX
-    shares = [100 * time / SPEED / total for time, _ in lines]
+    shares = [100 * time / total for time in shown]
     scroll = "".join(
         f"{share:.2f}%{{transform:translateY({-LINE_PX * (k + 1 - ROWS)}px)}}"
         for k, share in enumerate(shares)
@@ -55,12 +59,13 @@ def picture(lines: Sequence[tuple[float, str]]) -> str:
         ),
     ]
     texts = [
-        f'<text id="l{k}" x="12" y="{LINE_PX * (k + 1) + 4}">{escape(line)}</text>' for k, (_, line) in enumerate(lines)
+        f'<text id="l{k}" x="12" y="{LINE_PX * (k + 1) - 4}">{escape(line)}</text>' for k, (_, line) in enumerate(lines)
     ]
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img">'
         f"<title>Output of armident demo, {SPEED:g} times as fast</title><style>{STYLE}{''.join(styles)}</style>"
-        f'<rect width="100%" height="100%" rx="8" fill="#171c24"/><g>{"".join(texts)}</g></svg>\n'
+        f'<rect width="100%" height="100%" rx="8" fill="#171c24"/>'
+        f'<svg y="8" height="{ROWS * LINE_PX}"><g>{"".join(texts)}</g></svg></svg>\n'
     )
 
 

@@ -21,9 +21,24 @@ def test_a_lerobot_data_set_is_imported_as_file_and_folder(tmp_path: Path, names
         found = import_recording(path, TX40)
         assert same(found, motion(300, 50.0))
         assert found.sample_rate_hz == pytest.approx(50, rel=1e-4)
-        assert [(gap.first, gap.last) for gap in found.gaps if gap.stream == "samples"] == [(200, 248)]
+        assert [(gap.first, gap.last) for gap in found.gaps if gap.stream == "samples"] == [(200, 204)]
         assert "demand" in found.samples.fields
         assert "2 episodes" in found.metadata["source_remarks"]
+
+
+def test_short_episodes_are_identified_one_by_one(tmp_path: Path) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    from armident.identify.identification.from_recording import experiments_from_recording
+
+    data = lerobot(tmp_path / "a", None)
+    table = pyarrow.parquet.read_table(data).drop_columns("episode_index")
+    episodes = pyarrow.array(np.repeat(np.arange(3), 100))
+    pyarrow.parquet.write_table(table.append_column("episode_index", episodes), data)
+    experiments, notes = experiments_from_recording(import_recording(tmp_path / "a", TX40), TX40)
+    assert [len(one.q) for one in experiments] == [100, 100, 100]
+    assert "10 of 310 samples missing: 3 pieces" in " ".join(notes)
 
 
 def test_joints_of_a_lerobot_data_set_are_found_by_name_and_its_effort_is_needed(tmp_path: Path) -> None:

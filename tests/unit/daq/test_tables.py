@@ -49,6 +49,40 @@ def test_columns_of_joints_in_another_order_are_found_by_name(tmp_path: Path) ->
     assert same(import_recording(path, TX40, by_position=True), motion())
 
 
+def test_a_stated_name_may_be_the_word_beside_the_names_of_joints(tmp_path: Path) -> None:
+    order = [0, *range(6, 0, -1), *range(12, 6, -1)]
+    names = ["Zeit", *(f"{joint.name} Winkel" for joint in TX40.joints), *(f"Moment {j.name}" for j in TX40.joints)]
+    path = written(tmp_path / "a.csv", motion()[:, order], [names[k] for k in order])
+    stated = {"time": "Zeit", "position": "winkel", "torque": "Moment"}
+    assert same(import_recording(path, TX40, names=stated), motion())
+    with pytest.raises(DataError, match="no column named 'Kraft'; found Zeit, joint_6 Winkel"):
+        import_recording(path, TX40, names=stated | {"torque": "Kraft"})
+
+
+def test_the_log_of_libfranka_has_measured_and_desired_positions(tmp_path: Path) -> None:
+    values = motion()
+    kinds = {
+        "state.q": values[:, 1 : N + 1],
+        "state.q_d": values[:, 1 : N + 1] + 1e-4,
+        "state.tau_J": values[:, N + 1 :],
+    }
+    columns = [1e3 * values[:, :1] + 812345, *kinds.values(), 0 * values[:, 1 : N + 1]]
+    names = ["time", *(f"{kind}[{j}]" for kind in (*kinds, "cmd.tau_J_d") for j in range(N))]
+    found = import_recording(written(tmp_path / "a.csv", np.hstack(columns), names), TX40, time_unit="ms")
+    assert same(found, values)
+    assert np.allclose(found.samples.raw["demand"], kinds["state.q_d"], rtol=0, atol=1e-8)
+    assert found.metadata["source_remarks"].count("counted from 0") == 1
+
+
+def test_a_name_that_two_columns_have_is_refused_only_where_it_is_needed(tmp_path: Path) -> None:
+    older = ["duration", *(f" {kind}[{j}]" for kind in ("q", "tau_J", "dq_d", "dq_d") for j in range(N))]
+    values = np.hstack([motion(), np.ones((400, 2 * N))])
+    assert same(import_recording(written(tmp_path / "a.csv", values, older), TX40), motion())
+    path = written(tmp_path / "b.csv", motion(), ["t", "q1", *NAMES[1:6], *NAMES[7:]])
+    with pytest.raises(DataError, match=r"expected columns q1\.\.q6 .*found t, q1 in 2 columns, q2"):
+        import_recording(path, TX40)
+
+
 def test_a_missing_column_lists_what_was_found(tmp_path: Path) -> None:
     path = written(tmp_path / "a.csv", motion()[:, :12], NAMES[:12])
     with pytest.raises(DataError, match=r"no column tau6, the robot has 6 joints; found t, q1, .*tau5$"):

@@ -354,6 +354,17 @@ def test_dry_friction_of_a_few_steps_is_not_clipped(steps: int, healthy: list[Ex
     assert clipped_findings(coarse, arm, np.ones(arm.n, dtype=np.bool_)) == []
 
 
+def test_a_torque_below_the_steps_of_its_signal_is_not_called_clipped(
+    healthy: list[Experiment], arm: RobotConfig
+) -> None:
+    step = 0.9 * np.abs(healthy[0].tau[:, 1]).max()
+    coarse = [replace(e, tau=np.where([False, True, False], step * (e.tau > step), e.tau)) for e in healthy]
+    (finding,) = clipped_findings(coarse, arm, np.ones(3, dtype=np.bool_))
+    assert (finding.joints, finding.decisive) == (("axis_2",), True)
+    assert "of axis_2 is 0 in" in finding.message
+    assert "finer steps" in finding.remedy
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.4, pytest.param(0.6, marks=pytest.mark.nightly)])
 def test_a_torque_that_saturates_softly_is_not_clipped(
