@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from armident.arrays import Array
 from armident.configs import DataError, RobotConfig
 from armident.identify.effects.recording_corrections import corrected_experiments
 from armident.identify.effects.terms import arm_model
@@ -29,7 +30,6 @@ from armident.identify.identification.equations import (
 )
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.identification_result import (
-    Array,
     IdentificationResult,
     LeastSquares,
     MethodResult,
