@@ -158,7 +158,8 @@ class Week:
         self.plant.shorten(cell, 15.0)
         self.plant.services[cell.name].kill()
         out, _ = processes.armident("keys", "check", "--folder", self.plant.host).communicate()
-        fault.note = next((line for line in out.splitlines() if line.startswith("failed") and name in line), "no alarm")
+        lines = [line for line in out.splitlines() if line.startswith("failed") and name in line]
+        fault.note = lines[0] if lines else f"no alarm: {out[-300:]!r}"
         yield 15.0 + 10.0 * size, self.heard("result", cell)
         processes.armident("keys", "renew", name, "--folder", self.plant.folder).communicate()
         self.plant.install(name)
@@ -245,7 +246,7 @@ def run(
         audit.add_logs(plant.logs)
         audit.wrong += [*week.passed, *(f"forged on {key}" for key in listener.forged)]
         audit.wrong += [f"{each.kind}, {each.target}: no work after it" for each in week.faults if not each.went_on_s]
-        audit.wrong += [f"{each.target}: no alarm" for each in week.faults if each.note == "no alarm"]
+        audit.wrong += [f"{each.target}: {each.note}" for each in week.faults if each.note.startswith("no alarm")]
         report = {
             "minutes": minutes, "seed": seed, "took_s": round(time.monotonic() - week.began), "load": os.getloadavg(),
             "history": "PostgreSQL" if server else "SQLite", "missing": sorted(missing),
