@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from armident.configs import ConfigError, DataError
+from armident.daq.recording.layout import short_reason
 
 T = TypeVar("T", bound=BaseModel)
 
@@ -51,7 +52,7 @@ def _parsed(text: str, where: str) -> Any:
     except json.JSONDecodeError as error:
         raise DataError(f"{where}: line {error.lineno}: not valid JSON: {error.msg}") from error
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{where}: not valid JSON: {error}") from error
+        raise DataError(f"{where}: not valid JSON: {short_reason(error)}") from error
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

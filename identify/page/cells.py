@@ -225,7 +225,7 @@ def _document(path: Path, _stamp: str, kind: str) -> Document | str:
         if (size := path.stat().st_size) > LARGEST:
             return f"{path}: {size / 1e6:.0f} MB, more than a document has; it is not read"
         return load_document(path, KINDS[kind])
-    except (ArmidentError, OSError, RecursionError) as error:
+    except (ArmidentError, OSError) as error:
         reason = str(error) if isinstance(error, ArmidentError) else f"{path}: cannot be read ({type(error).__name__})"
         return reason.replace(f"{path.parent.parent}/", "", 1)
 

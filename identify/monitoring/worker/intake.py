@@ -22,6 +22,7 @@ from armident.identify.monitoring.worker.recorded import (
     check_origin,
     fault_of_name,
     result_of,
+    shown,
     stamp_of,
 )
 from armident.identify.monitoring.worker.stream_buffer import MOST_NAMES, Assembly, StreamBuffer, drop_oldest
@@ -193,7 +194,7 @@ class Intake:
         if reason is None:
             self._said.pop(path, None)
         elif self._said.get(path) != reason:
-            log.info("%s: %s", path, reason)
+            log.info("%s: %s", shown(path), reason)
             self._said[path] = reason
 
     def _not_finished(self, path: Path) -> str | None:

@@ -79,6 +79,11 @@ class Captured:
         return join_parts([read_recording(path) for path in self.paths])
 
 
+def shown(path: Path) -> str:
+    """Return a path for a message, with escapes for letters that it cannot have."""
+    return _UNNAMEABLE.sub(lambda letter: repr(letter[0])[1:-1], str(path))
+
+
 def fault_of_name(path: Path) -> str | None:
     """Return why a file cannot be entered under its name; ``None`` if it can."""
     if _UNNAMEABLE.search(str(path)):
