@@ -398,7 +398,7 @@ def errors_of(
     block = ExperimentEquations(torque[:, None], x, np.ones((size, 1), bool), rest)
     found, ls = (SimpleNamespace(estimate=SimpleNamespace(theta=theta), blocks=[block]) for theta in np.eye(2))
     moving = SimpleNamespace(moving=np.array([True]))
-    one = SimpleNamespace(tau=(torque if recorded is None else recorded)[:, None])
+    one = SimpleNamespace(tau=(torque if recorded is None else recorded)[:, None], q_ref=None)
     return error(judged(robot=load_robot("emps"), found=found, ls=ls, support=moving, experiments=[one]), CRITERIA)
 
 
