@@ -142,8 +142,8 @@ def test_a_folder_of_a_result_that_refuses_it_holds_up_no_other(session: Session
     (tmp_path / "emps-$(c) [x].identification").touch()
     os.utime(tmp_path / "emps-b.mcap", (0.0, 0.0))
     with Worker(session, made.robot, tmp_path) as worker:
-        # Which one comes first depends on when they are found.
-        assert sorted([worker.result(LONGEST_S), worker.result(LONGEST_S)]) == [0, 2]
+        # A failure that is announced later, as Zenoh is not there yet, has the code of all failures.
+        assert [worker.result(LONGEST_S), worker.result(LONGEST_S)] in ([2, 0], [3, 0], [0, 3])
         entry = next(each for each in Ledger(tmp_path / FILE, "test").entries() if each.state == "failed")
         assert (entry.message or "").endswith("then: armident queue retry 'emps-$(c) [x]'")
         (tmp_path / "emps-$(c) [x].identification").unlink()
