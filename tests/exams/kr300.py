@@ -207,6 +207,7 @@ def load(clone: Path | None) -> list[Record]:
         read = loadmat(path)
         u, y = (np.hstack([read[f"{name}_{part}"] for part in ("train", "val", "test")]).T for name in "uy")
         u, y = (signal.reshape(-1, PIECES, PIECE - 1, RATIOS.size) for signal in (u, np.deg2rad(y)))
+    # loadmat answers a file of MATLAB 7.3 with NotImplementedError
     except (KeyError, ValueError, NotImplementedError, OSError, MatReadError) as error:
         raise DataError(f"{path} is not that file ({error}): {WHERE}") from error
     hole = np.full((len(u), PIECES, 1, RATIOS.size), np.nan)
