@@ -182,10 +182,11 @@ def run(recordings: Path, out: Path, workers: int, names: Sequence[str], failing
                 lines = [
                     line for line in (out / "stderr").read_text(encoding="utf-8").splitlines() if ".mcap: " in line
                 ]
-                if not killed_after and len(lines) >= max(1, len(names) // 2):
+                alive = [(p.peak, pid) for pid, p in processes_of(command.pid).items() if p.worker]
+                # A single worker may just have ended for want of memory.
+                if alive and not killed_after and len(lines) >= max(1, len(names) // 2):
                     killed_after = len(lines)
                     # The one with the largest memory is identifying.
-                    alive = [(p.peak, pid) for pid, p in processes_of(command.pid).items() if p.worker]
                     os.kill(max(alive)[1], signal.SIGKILL)
                 time.sleep(POLL_S)
         finally:
