@@ -16,6 +16,7 @@ import numpy as np
 from google.protobuf import descriptor_pb2
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from armident.configs import DataError
 from armident.daq.recording.mcap_records import RECORD_HEAD
@@ -302,6 +303,9 @@ def short_reason(error: Exception) -> str:
         return f"no entry {error}"
     if isinstance(error, UnicodeDecodeError):
         return f"byte {error.start} is no UTF-8 text"
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        return f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"[:160]
     if _PYTHON_TYPES.search(str(error)):
         return "an entry of another type than expected"
     return " ".join(str(error).split())[:160]

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 
 from armident.configs import load_robot, load_session, load_trajectory
 from armident.configs.loading import HERE, load_scenario
+from armident.configs.schema.limits import NO_LIMIT
 from armident.configs.yaml_loader import read_yaml
 from armident.daq.init.dh_table import from_dh_table
 from tests.fuzz.harness import MisreadError, Target
@@ -65,8 +66,8 @@ def _compare(said: Any, understood: Any, where: str) -> None:
     """Refuse a value that was understood otherwise than it was written."""
     if isinstance(said, dict) and isinstance(understood, dict):
         for key, value in said.items():
-            if value == math.inf and str(key) not in understood:
-                continue  # no limit: JSON has no word for it
+            if _is_no_limit(value, f"{where}.{key}") and str(key) not in understood:
+                continue  # JSON has no word for it
             if str(key) not in understood and f"0x{key}" not in understood:
                 raise MisreadError(f"{where}.{key} was not taken")
             _compare(value, understood[str(key)], f"{where}.{key}")
@@ -79,10 +80,15 @@ def _compare(said: Any, understood: Any, where: str) -> None:
         if said is not understood:
             raise MisreadError(f"{where}: {said!r} taken as {understood!r}")
     elif isinstance(understood, int | float):
-        if not math.isclose(float(said), understood, rel_tol=1e-15):
+        if not _is_no_limit(said, where) and not math.isclose(float(said), understood, rel_tol=1e-15):
             raise MisreadError(f"{where}: {said!r} taken as {understood!r}")
     elif not str(understood).endswith(str(said).removeprefix("./").removeprefix("../")) and "/" not in str(said):
         raise MisreadError(f"{where}: {said!r} taken as {understood!r}")
+
+
+def _is_no_limit(said: Any, where: str) -> bool:
+    number = isinstance(said, int | float) and not isinstance(said, bool)
+    return number and (said == math.inf or (".limits." in where and abs(said) >= NO_LIMIT))
 
 
 def _load_trajectory(path: Path) -> BaseModel:
