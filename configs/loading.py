@@ -73,9 +73,10 @@ def _shipped(path: Path) -> Path | None:
     if path.is_absolute():
         return None
     relative = Path(*path.parts[1:]) if path.parts[:1] == ("configs",) else path
-    folders = (HERE, *(HERE / folder for folder in SHIPPED))
-    candidates = (c for folder in folders for c in (folder / relative, (folder / relative).with_suffix(".yaml")))
-    return next((c for c in candidates if is_file(c)), None)
+    files = [folder / relative for folder in (HERE, *(HERE / folder for folder in SHIPPED))]
+    if relative.suffix in ("", ".yml"):
+        files = [found for file in files for found in (file, file.with_suffix(".yaml"))]
+    return next((file for file in files if is_file(file)), None)
 
 
 def load_robot(name: str | Path, command: str = "") -> RobotConfig:

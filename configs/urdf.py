@@ -186,8 +186,9 @@ def joint_names(names: list[str], file: Path) -> list[str]:
         twins = [other for other in plain if other.lower() == plain[k].lower()]
         if not plain[k] or (len(twins) > 1 and not name.isascii()):
             plain[k] = f"joint_{k + 1}"
-    if len({name.lower() for name in plain}) < len(plain):
-        raise ConfigError(f"{file}: joint names differ only in case or punctuation: {', '.join(names)}")
+    lower = [name.lower() for name in plain]
+    if twins := [f"{name:.60}" for name, key in zip(names, lower, strict=True) if lower.count(key) > 1]:
+        raise ConfigError(f"{file}: joint names differ only in case or punctuation: {', '.join(twins[:10])}")
     return plain
 
 

@@ -13,6 +13,9 @@ from armident.configs.schema.robot import RobotConfig
 RAMP_SHARE = 0.4
 """Usual share of a move's duration spent accelerating, and again decelerating; the rest is at constant speed."""
 
+SHORTEST_S = 1e-6
+"""Shortest move, s; no drive takes positions as fast."""
+
 LONGEST_S = 3600.0
 """Longest trajectory, s; its set points are kept in memory while it is played."""
 
@@ -28,7 +31,7 @@ class Move(FrozenModel):
     to
         Target, rad or m, length n.
     duration
-        Duration of the move, s.
+        Duration of the move, s; at least `SHORTEST_S`.
     dwell
         Time at rest after the move, s.
     ramp
@@ -36,7 +39,7 @@ class Move(FrozenModel):
     """
 
     to: tuple[float, ...]
-    duration: Annotated[float, Field(gt=0)]
+    duration: Annotated[float, Field(ge=SHORTEST_S)]
     dwell: Annotated[float, Field(ge=0)] = 0.0
     ramp: Annotated[float, Field(gt=0, le=0.5)] = RAMP_SHARE
 
