@@ -116,8 +116,11 @@ def spoil_tree(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
 
 
 def spoil_json(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
-    """Changes what a JSON document says."""
-    tree = json.loads(rng.choice(seeds))
+    """Changes what a JSON document says, in a document that is well-formed."""
+    try:
+        tree = json.loads(rng.choice(seeds))
+    except ValueError:
+        return spoil_text(rng, seeds)
     for _ in range(rng.choice((1, 1, 2, 3))):
         _spoil_node(rng, tree)
     return json.dumps(tree).encode()
