@@ -1,7 +1,7 @@
 """Root of the command line: finds the registered commands and loads the one that is called.
 
-A command is an entry point of group ``armident.commands`` that names a function with typer annotations. Its module must
-import quickly: heavy imports belong into the function.
+A command is an entry point of group ``armident.commands`` that names a function with typer annotations; it may return
+an exit code. Its module must import quickly: heavy imports belong into the function.
 """
 
 import atexit

@@ -81,8 +81,7 @@ def simulate_recording(
     """Simulate a recording of the virtual arm on a trajectory, as ``armident capture`` would write it.
 
     Streams are ``samples`` (position, effort, status) and ``demand``, with marks of the experiment. ``settle``: rest
-    before and after it, s; ``setpoint_every``: SYNCs; ``start_ns``: stamp of SYNC 0. Raises ConfigError if the
-    trajectory exceeds limits.
+    before and after it, s; ``setpoint_every``: SYNCs. Raises ConfigError if the trajectory exceeds limits.
     """
     trajectory.check(robot)
     every, period = setpoint_every, servo.control_period(robot) if period is None else period

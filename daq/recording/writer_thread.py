@@ -174,10 +174,7 @@ class QueuedSeries:
             self._chunk.since, self._chunk.may_begin_file = t_ns, True
 
     def append(self, rows: Mapping[str, Columns]) -> None:
-        """Add rows of the same time to several streams, which no file divides; the arrays must not change afterwards.
-
-        By stream: SYNC numbers (N,), their receive times (N,), ns UTC, and raw values (N, n) of every field.
-        """
+        """Add rows of the same time to several streams, which no file divides; the arrays must not change later."""
         sizes = {
             stream: sync.nbytes + t_ns.nbytes + sum(values.nbytes for values in raw.values())
             for stream, (sync, t_ns, raw) in rows.items()

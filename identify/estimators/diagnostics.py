@@ -86,8 +86,7 @@ def diagnose_estimate(
 
     ``instruments``: regressor (M, n, b) at simulated signals at the final theta; ``None``: least squares. ``weights``:
     noise models of the rows, those of the estimate by default; they differ where a model entered the covariance alone.
-    ``essential``: mask (b,) for the F test. ``max_order``: of noise models of the residuals where the weights have
-    none.
+    ``essential``: mask (b,) for the F test.
     """
     _check(names, joints, blocks, instruments)
     weights = list(weights or estimate.noise)
@@ -120,10 +119,7 @@ def diagnose_estimate(
 
 
 def nested_f_test(theta: Array, covariance: Array, kept: NDArray[np.bool_], equations: int) -> NestedFit:
-    """F test that all parameters but the kept ones, mask (b,), are zero together; ``equations``: number of rows.
-
-    For least squares it is the ratio of the sums of squares of the two fits; for instruments the Wald form of it.
-    """
+    """F test (least squares), or its Wald form, that all parameters but those of the mask (b,) are zero together."""
     out = np.flatnonzero(~kept)
     degrees = (out.size, max(equations - theta.size, 1))
     if out.size == 0:

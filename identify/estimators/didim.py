@@ -35,8 +35,6 @@ def didim(
         The simulated closed loop with the true controller; its regressor passes the same filter.
     start
         First theta of the auxiliary model, shape (b,).
-    true_sensitivities
-        Covariance with the Jacobian of the simulated torque, for b more simulations.
 
     Notes
     -----
@@ -64,10 +62,7 @@ def didim(
 def solve_didim(
     blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array
 ) -> tuple[Iterations, Sequence[ExperimentEquations]]:
-    """Iterations of DIDIM (2.36), and the equations of every experiment simulated at their last theta.
-
-    Raises DataError if no auxiliary model runs, not even the first.
-    """
+    """Iterations of DIDIM (2.36), and the equations simulated at their last theta; DataError if no loop runs."""
     scale = noise = joint_variances(blocks, np.zeros_like(start))
 
     def step(previous: Array, _: int) -> tuple[Array, float]:

@@ -44,11 +44,7 @@ def sensitivities(auxiliary: AuxiliaryModel, theta: Array, response: Response, s
 
 
 def difference_steps(zeta: Arrays, torques: Arrays, errors: Arrays, keep: Sequence[NDArray[np.bool_]]) -> Array:
-    """Finite-difference steps (b,) on the scale of each parameter's standard deviation.
-
-    Per experiment, ``zeta``: filtered regressor at simulated signals (M, n, b); torques and their unexplained part (M,
-    n), N m or N; equations to keep (M, n).
-    """
+    """Finite-difference steps (b,) on the scale of each parameter's standard deviation, by instruments (M, n, b)."""
     noise = [
         ArModel(np.empty(0), max(e.variance, LEAST_TORQUE**2 * y.variance), 0.0)
         for e, y in zip(ar_models(errors, 0, keep=keep), ar_models(torques, 0, keep=keep), strict=True)
@@ -57,10 +53,7 @@ def difference_steps(zeta: Arrays, torques: Arrays, errors: Arrays, keep: Sequen
 
 
 def weighted_columns(columns: Sequence[Arrays], keep: Sequence[NDArray[np.bool_]], noise: Sequence[ArModel]) -> Array:
-    """Jacobian of 4.2 and 4.4 (rows, b): each column stacked joint by joint and weighted.
-
-    ``columns``: by parameter, its derivatives (M, n) by experiment; ``noise``: models of the joints.
-    """
+    """Jacobian (rows, b) of 4.2 and 4.4, whitened; ``columns``: derivatives (M, n) by parameter and experiment."""
     return np.stack([whitened(column, noise, keep) for column in columns], axis=1)
 
 

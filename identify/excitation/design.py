@@ -89,8 +89,7 @@ def design_trajectory(
     ``duration`` (s) is met within a millisecond. ``noise``: standard deviations (n,) of the filtered torque noise, the
     weight; by default proportional to the torque limits. ``evaluations``: number of candidates. ``margin``: usable
     share of each limit. ``theta``: standard or base parameters, so that torques stay within limits. ``aim``: effects to
-    make visible. ``shape``: trapezoidal ``moves`` or a ``fourier`` series of ``harmonics``. Raises ConfigError if no
-    move or no candidate keeps the limits.
+    make visible. ``shape``: trapezoidal ``moves`` or a ``fourier`` series of ``harmonics``.
     """
     robot.check_movable()
     model = arm_model(robot)
@@ -205,7 +204,7 @@ def predict_precision(
     """Predict condition number and standard deviations of an identification along a trajectory.
 
     ``noise``: of the filtered torques (n,), N m or N; without ``known_noise`` only a weight, so no standard deviations.
-    ``cutoff_hz``: low-pass; one sample per independent interval is kept (thesis section 2.3.2).
+    After the low-pass, one sample per independent interval is kept (thesis section 2.3.2).
     """
     period = PERIOD
     q, qd, qdd = sample_trajectory(trajectory, period)

@@ -56,10 +56,7 @@ FEW, MANY = 2, 12
 
 @dataclass(frozen=True)
 class SimulatedBias:
-    """Mean bias (b,) of simulated recordings and scatter (b,) by encoder noise, SI.
-
-    ``share``: of the experiments that were simulated; the scatter of all is smaller by its square root.
-    """
+    """Mean bias (b,) of simulated recordings, and scatter (b,) by encoder noise, SI; ``share``: of the experiments."""
 
     bias: Array
     scatter: Array
@@ -84,11 +81,7 @@ def simulated_bias(
     runs: int | None = None,
     share: float = 1.0,
 ) -> SimulatedBias | None:
-    """Bias of an instrumental-variable estimate; ``None`` if its loop fails or leaves parameters undetermined.
-
-    ``weights``: noise models of the joints; ``share``: of experiments simulated; ``runs``: few if irrelevant, else
-    many.
-    """
+    """Bias of an instrumental-variable estimate; ``None`` if its loop fails; ``share``: of experiments simulated."""
     auxiliary, theta = auxiliary.fresh(), estimate.theta
     clean = auxiliary.simulate(theta)
     if clean is None:

@@ -31,10 +31,7 @@ def triangularize(*blocks: Array, columns: int, scales: Sequence[Array] = ()) ->
 
 
 def triangularize_parts(parts: Iterable[Sequence[Array]], columns: int) -> tuple[Array, Array]:
-    """`triangularize` of rows that come in parts (equal column counts), of which one is in memory.
-
-    Returns factor and projections (b, p), and the norm (p,) of every column, 1 where it is zero.
-    """
+    """`triangularize` of rows that come in parts; also the norm (p,) of every column, 1 where it is zero."""
     top, squares = np.empty((0, 0)), np.zeros(0)
     for part in parts:
         work = np.column_stack(part)

@@ -32,11 +32,7 @@ class LiveDerivatives:
 
 
 class VelocityFilter:
-    """Causal filter for velocities and accelerations of n joints, sample by sample or batch by batch.
-
-    ``nvr``: as for the smoother, for instance ``automatic_nvr(q[:, j], 3)`` of an earlier recording. There is no lag
-    while the acceleration is constant.
-    """
+    """Causal filter for velocities and accelerations of n joints; no lag while the acceleration is constant."""
 
     _saved = ("_x", "_p", "_measured")
 

@@ -31,7 +31,7 @@ POLL_S = 0.5
 
 @dataclass(frozen=True)
 class OnceIdentified:
-    """Identification of a recording, its file, and whether this process made it."""
+    """Identification of a recording, and its file."""
 
     document: IdentificationDocument
     path: Path
