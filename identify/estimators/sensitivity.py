@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel, Response
 from armident.identify.regression.ar_noise import ArModel, ar_models
-from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.regression.least_squares import column_norms
 from armident.identify.regression.whitening import whitened
 
@@ -62,15 +61,3 @@ def _quotient(moved: Response, response: Response, step: float) -> Response:
         tuple((a - b) / step for a, b in zip(moved.torque, response.torque, strict=True)),
         tuple((a - b) / step for a, b in zip(moved.position, response.position, strict=True)),
     )
-
-
-def torque_sensitivities(
-    auxiliary: AuxiliaryModel, theta: Array, blocks: Sequence[ExperimentEquations], noise: Sequence[ArModel]
-) -> Array:
-    """Weighted Jacobian (rows, b) of the simulated torque (4.4); DataError if no simulation near theta runs."""
-    theta, response = auxiliary.reachable(theta)
-    torques, keep = [b.y for b in blocks], [b.keep for b in blocks]
-    errors = [y - t for y, t in zip(torques, response.torque, strict=True)]
-    steps = difference_steps(auxiliary.regressors(auxiliary.motions(theta)), torques, errors, keep)
-    columns = sensitivities(auxiliary, theta, response, steps)
-    return weighted_columns([column.torque for column in columns], keep, noise)
