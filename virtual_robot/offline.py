@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from armident.arrays import Array
@@ -74,7 +73,6 @@ def simulate_recording(
     period: float | None = None,
     setpoint_every: int = 5,
     settle: float = 0.3,
-    start_ns: int = 0,
     velocity_feedback: bool | None = None,
     parameters: ArmParameters | None = None,
 ) -> Recording:
@@ -109,21 +107,17 @@ def simulate_recording(
         arm.advance()
 
     step_ns = round(period * 1e9)
-
-    def times(sync: NDArray[np.int64]) -> NDArray[np.int64]:
-        return start_ns + sync * step_ns
-
     sync = np.arange(total, dtype=np.int64)
     knots = np.arange(every - 1, total, every, dtype=np.int64)
     samples = Stream(
-        "samples", 1, sync, times(sync), sample_fields(robot),
+        "samples", 1, sync, sync * step_ns, sample_fields(robot),
         {"position": position, effort_of(robot): current, "status": np.full((total, n), OPERATION_ENABLED, np.uint16)},
     )  # fmt: skip
     fields = {"demand": Field("demand", "demand", _position_unit(robot), "motor", _per_count(robot))}
-    demands = Stream("demand", every, knots, times(knots), fields, {"demand": demand})
+    demands = Stream("demand", every, knots, knots * step_ns, fields, {"demand": demand})
     marks = (
-        Mark("experiment_start", first, start_ns + first * step_ns),
-        Mark("experiment_end", last, start_ns + last * step_ns),
+        Mark("experiment_start", first, first * step_ns),
+        Mark("experiment_end", last, last * step_ns),
     )
     return Recording(None, robot, None, 1.0 / period, {"samples": samples, "demand": demands}, marks=marks)
 

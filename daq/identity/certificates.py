@@ -177,9 +177,9 @@ def write_key(path: Path, key: PrivateKey, mode: int = 0o600) -> None:
     write_whole(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), mode)
 
 
-def write_identity(folder: Path, identity: Identity, mode: int = 0o600) -> None:
+def write_identity(folder: Path, identity: Identity) -> None:
     """Write ``NAME.key`` and then ``NAME.pem``, by which readers find an identity."""
-    write_key(folder / f"{identity.name}.key", identity.key, mode)
+    write_key(folder / f"{identity.name}.key", identity.key)
     write_whole(folder / f"{identity.name}.pem", pem_of(identity.certificate), 0o644)
 
 

@@ -80,7 +80,6 @@ def diagnose_estimate(
     instruments: Sequence[Array] | None = None,
     weights: Sequence[ArModel] | None = None,
     essential: NDArray[np.bool_] | None = None,
-    max_order: int = MAX_AR_ORDER,
 ) -> Diagnostics:
     """Test an estimate with its equations; ValueError if shapes do not belong together.
 
@@ -92,7 +91,7 @@ def diagnose_estimate(
     weights = list(weights or estimate.noise)
     noise = weights
     if not any(w.order for w in weights):
-        noise = noise_models(blocks, estimate.theta, estimate.covariance, max_order)
+        noise = noise_models(blocks, estimate.theta, estimate.covariance, MAX_AR_ORDER)
     keep, x = [b.keep for b in blocks], [b.x for b in blocks]
     rows = whitened(x, weights, keep)
     condition, relevance, endogeneity, ratio = None, None, None, 1.0

@@ -195,7 +195,6 @@ def predict_precision(
     trajectory: Trajectory,
     noise: ArrayLike,
     *,
-    cutoff_hz: float = CUTOFF,
     known_noise: bool = True,
     theta: ArrayLike | None = None,
     aim: EffectObjective | None = None,
@@ -210,15 +209,15 @@ def predict_precision(
     q, qd, qdd = sample_trajectory(trajectory, period)
     torque = None if theta is None else predicted_torque(model, theta, q, qd, qdd, period)
     x = model.base_regressor(q, qd, qdd, dt=period)
-    keep = max(1, round(0.5 / (cutoff_hz * period)))
-    sections = butter(4, 2.0 * cutoff_hz * period, output="sos")
+    keep = max(1, round(0.5 / (CUTOFF * period)))
+    sections = butter(4, 2.0 * CUTOFF * period, output="sos")
     x = sosfiltfilt(sections, x, axis=0)[keep // 2 :: keep] / np.asarray(noise, dtype=np.float64)[:, None]
     flat = x.reshape(-1, x.shape[2])
     _, singular, right = np.linalg.svd(flat, full_matrices=False)
     std = np.sqrt(((right / singular[:, None]) ** 2).sum(axis=0)) if known_noise else None
     wanted = None
     if aim is not None and known_noise:
-        decimation = design(period, cutoff_hz, keep)
+        decimation = design(period, CUTOFF, keep)
         motion = (model if theta is None else model.anchored(theta)).motion(q, qd, qdd, period)
         wanted = aim.std(motion, *equations_of(model, motion, decimation, np.asarray(noise, dtype=np.float64)))
     closest = None if collision is None else collision.closest(q)
