@@ -98,7 +98,9 @@ def _reported(function: Callable[..., Any], name: str) -> Callable[..., Any]:
         interrupts: list[int] = []
         try:
             with log_to(StderrHandler("armident"), level), _noted(interrupts):
-                function(*args, **kwargs)
+                code = function(*args, **kwargs)
+            if code:
+                raise typer.Exit(code)
         except (typer.Exit, typer.Abort, typer.BadParameter, BrokenPipeError):
             raise
         except KeyboardInterrupt:
