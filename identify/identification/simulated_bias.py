@@ -103,7 +103,8 @@ def simulated_bias(
         if not np.isfinite(found).all():
             return None
         errors.append(found - theta)
-        if runs is None and len(errors) == FEW and not _relevant(errors, estimate):
+        relevant = np.abs(np.mean(errors, axis=0)) > IdentificationCriteria.max_bias_std * estimate.std
+        if runs is None and len(errors) == FEW and not relevant.any():
             break
     return SimulatedBias(np.mean(errors, axis=0), np.std(errors, axis=0, ddof=1), len(errors), share)
 
@@ -122,10 +123,6 @@ def corrected(estimate: Estimate, found: SimulatedBias, blocks: Sequence[Experim
     )
     residuals = whitened_residuals(blocks, theta, estimate.noise)
     return replace(estimate, theta=theta, covariance=covariance, residuals=residuals)
-
-
-def _relevant(errors: Sequence[Array], estimate: Estimate) -> bool:
-    return bool(np.any(np.abs(np.mean(errors, axis=0)) > IdentificationCriteria.max_bias_std * estimate.std))
 
 
 def _recorded(

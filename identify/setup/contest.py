@@ -200,8 +200,3 @@ def _same_signals(kind: str, a: Array, b: Array, proportion: bool) -> bool:
     if proportion:
         off = off - np.median(off)
     return bool(np.abs(off).max() <= (SAME_PROPORTION if proportion else SAME_FACTOR))
-
-
-def words_of(steps: Sequence[Step]) -> list[str]:
-    """The last mistakes of steps in words, each once."""
-    return list(dict.fromkeys(step.mistakes[-1].words for step in steps))
