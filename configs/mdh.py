@@ -41,8 +41,7 @@ def modified_dh(axes: ArrayLike, points: ArrayLike, names: Sequence[str]) -> Mdh
 
     ``z_j`` is the axis of joint j, ``x_j`` the common normal of axes j and j+1: with the smaller ``|theta_j|``, between
     parallel axes that with ``r_j = 0``. Further, ``theta_n = r_n = alpha_1 = d_1 = 0``, and ``x_0`` is towards the
-    given x. ``axes``: unit vectors (n, 3); ``points``: one on each axis (n, 3), m. Raises ConfigError if two axes are
-    nearly parallel.
+    given x. ``axes``: unit vectors (n, 3); ``points``: one on each axis (n, 3), m.
     """
     z = np.array(axes, dtype=np.float64)
     p = np.asarray(points, dtype=np.float64)

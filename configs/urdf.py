@@ -24,17 +24,7 @@ from armident.configs.yaml_loader import is_file
 
 
 class UrdfSource(FrozenModel):
-    """Part of a URDF file to read.
-
-    Parameters
-    ----------
-    file
-        Path relative to the configuration.
-    base
-        First link of the chain; ``None``: the root of the tree.
-    tip
-        Last link of the chain; ``None``: the chain ends with its last moving joint.
-    """
+    """Part of a URDF file; ``base``, ``tip``: links of the chain, ``None``: root of the tree, last moving joint."""
 
     file: str
     base: str | None = None
@@ -42,18 +32,9 @@ class UrdfSource(FrozenModel):
 
 
 class LimitsGiven(FrozenModel):
-    """Limits that replace those of the URDF or add to them; URDF has no limit of acceleration.
+    """Limits, SI, that replace those of the URDF or add to them; URDF has no limit of acceleration.
 
     None is needed to learn from a recording; an arm that is to be moved needs all of them.
-
-    Parameters
-    ----------
-    position
-        Lower and upper limit, rad or m.
-    velocity, acceleration
-        Largest magnitudes, rad or m, per s and per s^2.
-    torque
-        Largest magnitude, N m or N.
     """
 
     model_config = ConfigDict(allow_inf_nan=True)
@@ -65,17 +46,7 @@ class LimitsGiven(FrozenModel):
 
 
 class JointGiven(FrozenModel):
-    """Additions of a configuration to a joint of the URDF.
-
-    Parameters
-    ----------
-    name
-        Name of the joint in the URDF, or as in the configuration (see `joint_name`).
-    limits
-        Limits that replace those of the URDF or add to them.
-    drive, rotor_inertia
-        As in `armident.configs.schema.robot.Joint`.
-    """
+    """Additions to a joint of the URDF; ``name``: that in the URDF, or as in the configuration (see `joint_name`)."""
 
     name: str
     limits: LimitsGiven = LimitsGiven()
@@ -84,19 +55,7 @@ class JointGiven(FrozenModel):
 
 
 class UrdfGeometry(FrozenModel):
-    """Keys of a robot configuration that are combined with a URDF.
-
-    Parameters
-    ----------
-    urdf
-        Part of the URDF to read.
-    joints
-        Additions to its joints.
-    gravity
-        Acceleration of gravity in the frame of the base link, m/s^2.
-    collision
-        Bodies to keep apart; boxes in the frame of the base link, capsules in those of the URDF's links.
-    """
+    """Keys combined with a URDF; ``gravity``, m/s^2, and boxes in that of the base link, capsules in the links'."""
 
     urdf: UrdfSource
     joints: tuple[JointGiven, ...] = ()
@@ -193,10 +152,7 @@ def joint_names(names: list[str], file: Path) -> list[str]:
 
 
 def joint_name(name: str) -> str:
-    """Name of a joint in a configuration: Latin letters and digits as in the URDF, underscores for other characters.
-
-    Accents are dropped, and a name that begins with a digit follows ``joint_``. Empty if no letter or digit is left.
-    """
+    """Name of a joint in a configuration: letters without accents, digits and underscores of that in the URDF."""
     letters = "".join(c for c in unicodedata.normalize("NFKD", name) if not unicodedata.combining(c))
     plain = re.sub(r"[^A-Za-z0-9]+", "_", letters).strip("_")
     return plain if not plain or plain[0].isalpha() else f"joint_{plain}"

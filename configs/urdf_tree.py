@@ -62,8 +62,7 @@ def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> t
 def serial_tips(file: Path, base: str | None = None) -> dict[str, tuple[str, ...]]:
     """Names of the moving joints to each link at which a serial chain can end: ends of branches, and their forks.
 
-    Chains that cannot be identified are left out, and all but one with the same joints. Raises ConfigError if the file
-    is no URDF or not a tree.
+    Chains that cannot be identified are left out, and all but one with the same joints.
     """
     tree = read_tree(file)
     found: dict[str, tuple[str, ...]] = {}

@@ -1,7 +1,7 @@
 """Root of the command line: finds the registered commands and loads the one that is called.
 
-A command is an entry point of group ``armident.commands`` that names a function with typer annotations. Its module must
-import quickly: heavy imports belong into the function.
+A command is an entry point of group ``armident.commands`` that names a function with typer annotations; it may return
+an exit code. Its module must import quickly: heavy imports belong into the function.
 """
 
 import atexit
@@ -98,7 +98,9 @@ def _reported(function: Callable[..., Any], name: str) -> Callable[..., Any]:
         interrupts: list[int] = []
         try:
             with log_to(StderrHandler("armident"), level), _noted(interrupts):
-                function(*args, **kwargs)
+                code = function(*args, **kwargs)
+            if code:
+                raise typer.Exit(code)
         except (typer.Exit, typer.Abort, typer.BadParameter, BrokenPipeError):
             raise
         except KeyboardInterrupt:

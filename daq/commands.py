@@ -179,7 +179,7 @@ def service(
             "--executable", help="Path of armident in the units. [default: this one; in an image that in /opt/armident]"
         ),
     ] = None,
-) -> None:
+) -> int:
     """Install, list or remove the services of a cell on a machine with systemd: user, folders, permissions and units.
 
     install: what is there already is left alone; a second run does nothing. No service is enabled or started.
@@ -202,8 +202,7 @@ def service(
     else:
         raise ConfigError(f"no action {action!r}; expected: armident service install, status or uninstall CELL")
     print(*lines, sep="\n")
-    if not complete:
-        raise typer.Exit(FOUND)
+    return 0 if complete else FOUND
 
 
 def recover(

@@ -8,6 +8,7 @@ from dataclasses import MISSING, Field, field, fields, is_dataclass
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 M = TypeVar("M")
+R = TypeVar("R")
 
 
 def option(help: str, default: Any = MISSING, *, flag: str | None = None, **typer_options: Any) -> Any:
@@ -22,7 +23,7 @@ def documented(model: type[M]) -> type[M]:
     return model
 
 
-def with_options(command: Callable[..., None]) -> Callable[..., None]:
+def with_options(command: Callable[..., R]) -> Callable[..., R]:
     """Return a command of typer with one option for each field of the dataclasses among its parameters."""
     signature = inspect.signature(command)
     models: dict[str, Any] = {p.name: p.annotation for p in signature.parameters.values() if is_dataclass(p.annotation)}
@@ -31,13 +32,13 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     )
 
     @functools.wraps(command)
-    def wrapper(*args: Any, **kwargs: Any) -> None:
+    def wrapper(*args: Any, **kwargs: Any) -> R:
         bound = expanded.bind(*args, **kwargs)
         bound.apply_defaults()
         given = bound.arguments
         for name, model in models.items():
             given[name] = model(**{one.name: given.pop(one.name) for one in fields(model)})
-        command(**given)
+        return command(**given)
 
     wrapper.__signature__ = expanded  # type: ignore[attr-defined]
     wrapper.__annotations__ = {p.name: p.annotation for p in expanded.parameters.values()}

@@ -28,11 +28,7 @@ class Identified:
 
 @dataclass(frozen=True)
 class Investigated:
-    """Results of the second part.
-
-    ``document``, ``diagnosis``: contents of ``investigation.json`` and of the last ``diagnosis.json``; ``hidden``:
-    effects that were hidden, each with its joint.
-    """
+    """Results of the second part: contents of two documents, and the effects that were ``hidden``, with joints."""
 
     document: dict[str, Any]
     diagnosis: dict[str, Any]

@@ -38,10 +38,7 @@ DRY, VISCOUS = (0.05, 0.6), (0.05, 0.8)
 
 @dataclass(frozen=True, eq=False)
 class TorqueScale:
-    """Typical loads of the joints over postures, joint side, (n,) each, SI.
-
-    ``inertia``: mean diagonal of the mass matrix with rotors; ``gravity``: rms; ``torque``: with acceleration.
-    """
+    """Typical loads (n,) over postures, joint side, SI: mean ``inertia`` with rotors, ``gravity`` (rms), ``torque``."""
 
     inertia: Array
     gravity: Array

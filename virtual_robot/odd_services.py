@@ -3,7 +3,9 @@
 import struct
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
+from typing import Any
 
 import can
 
@@ -20,6 +22,30 @@ BURST = (0x8611, 0xFF05)
 
 BUSY = (0x08000020, 0x08000021, ABORT_DEVICE_STATE)
 """Abort codes of transfers that a drive cannot carry out now (CiA 301), in turn."""
+
+
+class _InBackground(Oddity):
+    """Oddity with a thread of its own until its end."""
+
+    def __init__(self) -> None:
+        self._over = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def _start(self, work: Callable[..., None], *arguments: Any) -> None:
+        self._thread = threading.Thread(target=work, args=arguments, daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """End the thread."""
+        self._over.set()
+        if self._thread is not None:
+            self._thread.join()
+
+
+def _later(delay_s: float, work: Callable[..., None], *arguments: Any) -> None:
+    timer = threading.Timer(delay_s, work, arguments)
+    timer.daemon = True
+    timer.start()
 
 
 class AbortBusy(Oddity):
@@ -48,9 +74,7 @@ class Twice(Oddity):
         """Repeat the answer."""
         if not self._delay:
             return [data, data]
-        again = threading.Timer(self._delay, self._again, (data,))
-        again.daemon = True
-        again.start()
+        _later(self._delay, self._again, data)
         return [data]
 
     def _again(self, data: bytes) -> None:
@@ -75,26 +99,24 @@ class ShortAnswer(Oddity):
         return [data[:4] if data[0] & 0xE0 == 0x60 else data]
 
 
-class OtherClient(Oddity):
+class OtherClient(_InBackground):
     """Another client on the SDO channel."""
 
     ANSWER_S = 0.5
     """Longest wait for an answer, s, as in the canopen library and ours."""
 
     def __init__(self, drive: Drive) -> None:
+        super().__init__()
         self._node = drive.node_id
         self._request = can.Message(
             arbitration_id=od.COB_SDO_REQUEST + drive.node_id,
             is_extended_id=False,
             data=struct.pack("<BHBL", 0x40, od.ERROR_REGISTER, 0, 0),
         )
-        self._over = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def begin(self, bus: Bus) -> None:
         """Read the error register at up to 200 Hz: a client waits for the answer to its last request."""
-        self._thread = threading.Thread(target=self._run, args=(bus,), daemon=True)
-        self._thread.start()
+        self._start(self._run, bus)
 
     def _run(self, bus: Bus) -> None:
         answers = [{"can_id": od.COB_SDO_RESPONSE + self._node, "can_mask": 0x7FF, "extended": False}]
@@ -112,12 +134,6 @@ class OtherClient(Oddity):
             if answer is not None and bytes(answer.data[1:4]) == bytes(self._request.data[1:4]):
                 return
 
-    def end(self) -> None:
-        """Stop reading."""
-        self._over.set()
-        if self._thread is not None:
-            self._thread.join()
-
 
 class Autostart(Oddity):
     """The drive becomes operational by itself."""
@@ -128,9 +144,7 @@ class Autostart(Oddity):
     def nmt(self, command: int) -> bool:
         """Start 30 ms after a command to pre-operational."""
         if command == NmtCommand.PRE_OPERATIONAL:
-            timer = threading.Timer(0.03, self._drive.nmt.enter, (NmtState.OPERATIONAL,))
-            timer.daemon = True
-            timer.start()
+            _later(0.03, self._drive.nmt.enter, NmtState.OPERATIONAL)
         return True
 
 
@@ -145,9 +159,7 @@ class SlowBoot(Oddity):
         """Begin to boot; commands that come meanwhile are not executed."""
         if self._booted is None:
             self._booted = False
-            timer = threading.Timer(self._boot_s, self._boot)
-            timer.daemon = True
-            timer.start()
+            _later(self._boot_s, self._boot)
         return self._booted
 
     def request(self, data: bytes) -> bool:
@@ -159,19 +171,17 @@ class SlowBoot(Oddity):
         self._drive.nmt.boot()
 
 
-class EmcyBurst(Oddity):
+class EmcyBurst(_InBackground):
     """Thousands of emergency messages after NMT start."""
 
     def __init__(self, drive: Drive) -> None:
+        super().__init__()
         self._drive = drive
-        self._over = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def nmt(self, command: int) -> bool:
         """Begin the burst, once."""
         if command == NmtCommand.START and self._thread is None:
-            self._thread = threading.Thread(target=self._send, daemon=True)
-            self._thread.start()
+            self._start(self._send)
         return True
 
     def _send(self) -> None:
@@ -182,9 +192,3 @@ class EmcyBurst(Oddity):
             with suppress(can.CanError, OSError):
                 self._drive.emcy.send(BURST[k % 2], 1, struct.pack("<HHB", k, 0, 7))
             time.sleep(0.0003)
-
-    def end(self) -> None:
-        """Stop the burst."""
-        self._over.set()
-        if self._thread is not None:
-            self._thread.join()

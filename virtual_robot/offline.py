@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from armident.arrays import Array
@@ -74,15 +73,13 @@ def simulate_recording(
     period: float | None = None,
     setpoint_every: int = 5,
     settle: float = 0.3,
-    start_ns: int = 0,
     velocity_feedback: bool | None = None,
     parameters: ArmParameters | None = None,
 ) -> Recording:
     """Simulate a recording of the virtual arm on a trajectory, as ``armident capture`` would write it.
 
     Streams are ``samples`` (position, effort, status) and ``demand``, with marks of the experiment. ``settle``: rest
-    before and after it, s; ``setpoint_every``: SYNCs; ``start_ns``: stamp of SYNC 0. Raises ConfigError if the
-    trajectory exceeds limits.
+    before and after it, s; ``setpoint_every``: SYNCs. Raises ConfigError if the trajectory exceeds limits.
     """
     trajectory.check(robot)
     every, period = setpoint_every, servo.control_period(robot) if period is None else period
@@ -110,21 +107,17 @@ def simulate_recording(
         arm.advance()
 
     step_ns = round(period * 1e9)
-
-    def times(sync: NDArray[np.int64]) -> NDArray[np.int64]:
-        return start_ns + sync * step_ns
-
     sync = np.arange(total, dtype=np.int64)
     knots = np.arange(every - 1, total, every, dtype=np.int64)
     samples = Stream(
-        "samples", 1, sync, times(sync), sample_fields(robot),
+        "samples", 1, sync, sync * step_ns, sample_fields(robot),
         {"position": position, effort_of(robot): current, "status": np.full((total, n), OPERATION_ENABLED, np.uint16)},
     )  # fmt: skip
     fields = {"demand": Field("demand", "demand", _position_unit(robot), "motor", _per_count(robot))}
-    demands = Stream("demand", every, knots, times(knots), fields, {"demand": demand})
+    demands = Stream("demand", every, knots, knots * step_ns, fields, {"demand": demand})
     marks = (
-        Mark("experiment_start", first, start_ns + first * step_ns),
-        Mark("experiment_end", last, start_ns + last * step_ns),
+        Mark("experiment_start", first, first * step_ns),
+        Mark("experiment_end", last, last * step_ns),
     )
     return Recording(None, robot, None, 1.0 / period, {"samples": samples, "demand": demands}, marks=marks)
 

@@ -15,7 +15,7 @@ from armident.virtual_robot import dynamics
 from armident.virtual_robot.arm_parameters import ArmParameters, arm_parameters, with_scenario
 from armident.virtual_robot.effects import Hidden, hidden_effects
 from armident.virtual_robot.effects.bodies import add_rotors, base_vibrations, change_bodies, hinge_damping, rest_angles
-from armident.virtual_robot.effects.bristles import bristle_table, sliding_level
+from armident.virtual_robot.effects.bristles import bristle_table
 from armident.virtual_robot.effects.forces import force_table
 from armident.virtual_robot.effects.gears import gear_rows, twist_under
 from armident.virtual_robot.model import build_model
@@ -138,28 +138,6 @@ class Plant:
                 folded[j, j] += self.rotor[self._link[j], self._link[j]]
         mass: Array = _symmetric(pin.crba(self.model, self._data, position))[:n, :n] + folded
         return mass
-
-    def resistance(self, q: Array, qd: Array, t: float = 0.0) -> Array:
-        """Torques (n,) of friction, brakes and hidden effects against the motors, N m or N; bristles slide steadily."""
-        n = q.size
-        out, slope = np.empty(n), np.empty((n, n))
-        arguments = (q, qd, t, *self._resisting, out, slope)
-        dynamics.friction_torques(*arguments)
-        for row in self._rows:
-            j = int(row[0])
-            out[j] += np.sign(qd[j]) * sliding_level(row, qd[j])[0]
-        return out
-
-    def acceleration(self, q: Array, qd: Array, tau: Array, t: float = 0.0) -> Array:
-        """Accelerations (N,) at torques (n,), N m or N, without `advance`'s approximations; bristles slide steadily."""
-        n, total = self.q.size, self.coordinates.size
-        force, slope = np.zeros(total), np.zeros((total, total))
-        force[:n] = self.resistance(q[:n], qd[:n], t) - tau
-        dynamics.gear_torques(q, qd, self._gears, force, slope, slope)
-        if self._vibrations.size:
-            self._add_base_vibration(t)
-        force[self._link] += pin.nonLinearEffects(self.model, self._data, q[self._link], qd[self._link])
-        return np.asarray(np.linalg.solve(self._inertia(q), -force), np.float64)
 
     def advance(self, tau: Array, period: float) -> None:
         """Integrate over one control period with constant torques. ``tau``: joint torques, N m or N, shape (n,)."""

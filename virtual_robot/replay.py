@@ -16,8 +16,7 @@ class Replay:
     """Drive backend that replays positions and currents of a recording, one sample per SYNC.
 
     The first sample is repeated until all drives of ``joints`` are enabled, the last one at the end, and in a gap the
-    one before. Set points are ignored. Raises ConfigError if it is of another robot or rate, DataError if it lacks
-    values or exceeds ranges.
+    one before. Set points are ignored.
     """
 
     def __init__(self, recording: Recording, robot: RobotConfig, sync_period: float, joints: tuple[int, ...]) -> None:

@@ -96,9 +96,7 @@ def record_robot(
     """Write a simulated recording of one trajectory of the virtual arm, without a bus; options as for ``run_robot``.
 
     ``trajectory``: a trajectory, or a table of references (.csv), whose rate is that of the recording; each table has
-    noise of its own.
-    ``encoder_counts``: per motor turn in place of the robot's, also for the control loops. Raises ConfigError if a file
-    is wrong or exists, no trajectory is given, or the scenario has oddities.
+    noise of its own. ``encoder_counts``: per motor turn in place of the robot's, also for the control loops.
     """
     if out.exists():
         raise ConfigError(f"{out}: the file exists already")

@@ -38,10 +38,7 @@ MOTION_ERROR, COMMUNICATION_ERROR = 0x20, 0x10
 
 @dataclass(frozen=True)
 class ServerReport:
-    """Timing of the drives' answers: time that a SYNC waited in the kernel, us, and frames that the kernel dropped.
-
-    ``backlog_max``: SYNCs received at once.
-    """
+    """Timing of answers: wait of a SYNC in the kernel, us, most SYNCs at once, and frames that the kernel dropped."""
 
     syncs: int
     delay_p50_us: float

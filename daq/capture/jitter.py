@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.drivers.canopen.objects import COB_SYNC
+
 BIN_NS = 1_000
 """Width of a bin of the histogram, ns."""
 BINS = 50_000
@@ -18,8 +20,8 @@ PERCENTILES = (50.0, 99.0, 99.9)
 class SyncJitter:
     """Jitter over all SYNCs of one bus; ``overflow`` of the counter (CiA 301, 1019h; 0: none) shows missing SYNCs."""
 
-    def __init__(self, period_ns: int, overflow: int, sync_id: int = 0x80) -> None:
-        self._period, self._overflow, self._sync_id = period_ns, overflow, sync_id
+    def __init__(self, period_ns: int, overflow: int) -> None:
+        self._period, self._overflow = period_ns, overflow
         self._last: tuple[int, int] | None = None
         self._histogram = np.zeros(BINS, np.int64)
         self._count, self._sum, self._squares = 0, 0.0, 0.0
@@ -27,7 +29,7 @@ class SyncJitter:
 
     def take(self, frames: NDArray[Any]) -> None:
         """Add frames of the bus. ``frames``: frames (N,) in the order of reception; all but SYNC are ignored."""
-        sync = frames[frames["can_id"] == self._sync_id]
+        sync = frames[frames["can_id"] == COB_SYNC]
         if sync.size == 0:
             return
         t_ns = sync["t_ns"].astype(np.int64)

@@ -21,11 +21,7 @@ from armident.drivers.canopen.objects import COB_SDO_REQUEST, COB_SYNC
 
 @dataclass(frozen=True)
 class CapturePlan:
-    """Configuration and options of one capture.
-
-    ``duration``: s; ``None``: until the trajectory ends, or it is stopped. ``listen_only``: send nothing to the buses.
-    ``config``: file of the session, if it may be reloaded.
-    """
+    """Options of a capture; ``duration``: s, ``None``: until the trajectory ends; ``config``: if it may be reloaded."""
 
     session: SessionConfig
     robot: RobotConfig

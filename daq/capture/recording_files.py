@@ -6,8 +6,8 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Self
 
 from armident.configs import RobotConfig, SessionConfig
 from armident.configs.schema.session import RecordingOptions, Trigger
@@ -99,7 +99,7 @@ def next_time(directory: Path, robot: str, now: datetime.datetime) -> datetime.d
     return newest + _STAMP_STEP
 
 
-class RecordingRetention:
+class RecordingRetention(AbstractContextManager["RecordingRetention", None]):
     """Deletes old recordings of a robot in a ``with`` block; ``options`` may be exchanged at any time."""
 
     def __init__(self, options: RecordingOptions, directory: Path, robot: str) -> None:
@@ -131,10 +131,6 @@ class RecordingRetention:
             log.warning("retention: %s", "; ".join(said))
         self._said = said
         return deleted
-
-    def __enter__(self) -> Self:
-        """Return the object; its thread runs already."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """End the thread."""

@@ -41,10 +41,7 @@ _KEYS = (ec.EllipticCurvePublicKey, rsa.RSAPublicKey)
 
 @dataclass(frozen=True)
 class Identity:
-    """A role in a cell, `ANY_CELL` for an operator or viewer of the plant, with its key and certificate.
-
-    ``name``: common name of the certificate, ``ROLE.CELL`` or ``ROLE.PERSON``.
-    """
+    """A role in a cell, or `ANY_CELL`, with key and certificate; ``name``: ``ROLE.CELL`` or ``ROLE.PERSON``."""
 
     role: Role
     cell: str
@@ -129,11 +126,7 @@ def trusted_certificate(
     at: datetime,
     revoked: Container[int] = (),
 ) -> x509.Certificate:
-    """Return the certificate of these bytes, that one of the authorities has issued and that is valid at a time.
-
-    ``revoked``: serial numbers. DataError if it is of another authority, revoked, expired, not yet valid, or without a
-    role.
-    """
+    """Return a certificate that one of the authorities issued and that is valid and not ``revoked``; else DataError."""
     try:
         certificate = x509.load_der_x509_certificate(certificate_der)
     except (ValueError, TypeError, UnsupportedAlgorithm, x509.InvalidVersion) as error:
@@ -184,9 +177,9 @@ def write_key(path: Path, key: PrivateKey, mode: int = 0o600) -> None:
     write_whole(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), mode)
 
 
-def write_identity(folder: Path, identity: Identity, mode: int = 0o600) -> None:
+def write_identity(folder: Path, identity: Identity) -> None:
     """Write ``NAME.key`` and then ``NAME.pem``, by which readers find an identity."""
-    write_key(folder / f"{identity.name}.key", identity.key, mode)
+    write_key(folder / f"{identity.name}.key", identity.key)
     write_whole(folder / f"{identity.name}.pem", pem_of(identity.certificate), 0o644)
 
 

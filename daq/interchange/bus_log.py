@@ -31,8 +31,7 @@ def recording_from_log(
     """Return the recording of a log: its frames, matched by the mapping of a session.
 
     With several buses the log has the names of the session's. ``rate_hz``: of SYNC, stated for a log whose times do not
-    tell it. Raises ConfigError if a bus is absent, buses carry CAN FD, or ``rate_hz`` is not that of the session;
-    DataError if the log holds no SYNC or several runs, or its SYNC period or TPDO lengths are not those of the session.
+    tell it.
     """
     _check_classic(session, str(path))
     streams = captured_streams(session, robot)

@@ -167,8 +167,7 @@ def repeated_share(values: Floats) -> float:
 def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0, *, received: bool = False) -> Clock:
     """Return the clock of samples by their times (N,), s; missing samples are missing numbers.
 
-    ``received``: times are those of a receiver, whose jitter is not that of the samples. Raises `JitterError` if steps
-    are too uneven for that, and DataError if the times contradict ``rate_hz``.
+    ``received``: times are those of a receiver, whose jitter is not that of the samples.
     """
     steps = np.diff(times)
     median = float(np.median(steps))

@@ -167,7 +167,8 @@ def _with_header(head: _Head, before: Sequence[tuple[int, str, bool]], *, ends_e
     lengths = [len(cells_of(text, head.delimiter)) for _, text, _ in before]
     if ends_empty and head.columns > 1 and head.columns not in lengths:
         head.columns -= 1
-    fits = [cells for _, text, _ in before if len(cells := cells_of(text, head.delimiter)) in _widths(head.columns)]
+    widths = head.columns, head.columns + 1  # A header may end with a separator.
+    fits = [cells for _, text, _ in before if len(cells := cells_of(text, head.delimiter)) in widths]
     if not fits and before and not before[-1][2]:
         # A header that does not fit the values is named by the caller.
         fits = [cells_of(before[-1][1], head.delimiter)]
@@ -189,11 +190,6 @@ def _with_header(head: _Head, before: Sequence[tuple[int, str, bool]], *, ends_e
 
 def _repeats(cells: Sequence[str]) -> bool:
     return len(set(cells)) < len(cells)
-
-
-def _widths(columns: int) -> tuple[int, int]:
-    """Return the numbers of cells of a header: one more if it ends with a separator."""
-    return columns, columns + 1
 
 
 def delimiter_of(text: str) -> str | None:
@@ -306,8 +302,9 @@ def _slow(path: Path, encoding: str, head: _Head) -> CsvTable:
     if not rows:
         raise DataError(f"{path}: no values in it")
     notes = list(head.notes)
-    if line and not line.endswith(("\n", "\r")) and len(rows) > 1 and _is_cut(rows[-1], ends):
-        damaged = math.isnan(rows[-1][0]) and all(map(math.isnan, rows[-1]))
+    damaged = all(map(math.isnan, rows[-1]))
+    shorter = ends[-1] < min(ends[:-1], default=0)
+    if line and not line.endswith(("\n", "\r")) and len(rows) > 1 and (damaged or shorter):
         if damaged and bad.count:
             bad.count -= 1
         notes.append(f"the last line ({numbers[-1]}) is cut off and left out")
@@ -356,11 +353,6 @@ def _row(cells: list[str], head: _Head) -> tuple[list[float], str]:
             return [math.nan] * head.columns, f", column {k}: expected a number, found {excerpt(cell)}"
         values.append(value)
     return values, ""
-
-
-def _is_cut(row: Sequence[float], ends: Sequence[int]) -> bool:
-    """Return ``True`` if a last line without an end is damaged, or its last cell is shorter than all before."""
-    return all(map(math.isnan, row)) or ends[-1] < min(ends[:-1], default=0)
 
 
 def _commas_hint(columns: int, head: _Head) -> str:

@@ -44,10 +44,7 @@ _MOST_NS = 2**63 - 1
 
 @dataclass(frozen=True, eq=False)
 class MessageTable:
-    """M messages with one list of names and the same quantities: positions and efforts (M, m), or ``None``.
-
-    ``number`` (M,): on the topic, from 1. ``stamp``, ``logged`` (M,): stamp in the header and time of recording, ns.
-    """
+    """M messages of equal names and quantities, positions and efforts (M, m); ``number`` from 1; times in ns."""
 
     names: tuple[str, ...]
     number: NDArray[np.int64]

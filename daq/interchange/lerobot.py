@@ -121,10 +121,7 @@ def position_hint(position: NDArray[np.float64]) -> str:
 def calibrated(
     file: Path, labels: Sequence[str], robot: RobotConfig
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return factors and offsets (n,) from -100 to 100 of calibrated ranges to rad from their middles, by a file.
-
-    The file is that of ``lerobot-calibrate``. ``labels``: columns of the positions, in the robot's order.
-    """
+    """Return factors and offsets (n,) from -100 to 100 of ranges to rad, by a file of ``lerobot-calibrate``."""
     try:
         motors = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:

@@ -20,10 +20,7 @@ _OF_TABLES = frozenset(FLAGS) - {"topic", "effort"}
 
 
 class Reader:
-    """Reader of a format, and writer if ``writer`` names one.
-
-    Both are ``module:function`` in this package: (path, config, options) and (recording, path).
-    """
+    """Reader (path, config, options) of a format, and writer (recording, path), if any, as ``module:function``."""
 
     name: ClassVar[str]
     suffixes: ClassVar[tuple[str, ...]]

@@ -35,10 +35,7 @@ SIMULATED_S = 1e8
 
 @dataclass(frozen=True)
 class JointStates:
-    """Positions and efforts of a robot, SI units, (N, n), in the robot's order, at increasing times (N,), ns.
-
-    ``clock``: sentence on the times if they are not the stamps, else empty.
-    """
+    """Positions and efforts (N, n) of a robot, SI, at times (N,), ns; ``clock``: note on times that are no stamps."""
 
     t_ns: NDArray[np.int64]
     q: NDArray[np.float64]

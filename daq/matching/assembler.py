@@ -31,7 +31,7 @@ from armident.daq.matching.state import (
     output_buffers,
 )
 from armident.daq.recording import Gap
-from armident.drivers.canopen.objects import COB_SDO_REQUEST
+from armident.drivers.canopen.objects import COB_SDO_REQUEST, COB_SYNC
 
 INCOMPLETE_PACK = "pack not complete"
 """Reason of the gap after the last packed TPDO: no drive had to send these samples."""
@@ -104,12 +104,11 @@ class Assembler:
         period_ns: int,
         overflow: int = 240,
         first_counter: int | None = 1,
-        sync_id: int = 0x80,
         bus_of: Sequence[int] = (),
         nodes: Sequence[int] = (),
     ) -> None:
         self._streams, self._joints = tuple(streams), tuple(joints)
-        self._timing = sync_id, period_ns, overflow
+        self._timing = COB_SYNC, period_ns, overflow
         self._longest_gap = int(_LONGEST_OUTAGE_S * 1e9 / period_ns)
         buses = tuple(bus_of) or (0,) * len(joints)
         channel_of = np.full((max(buses) + 1, 0x800), -1, np.int64)
@@ -141,8 +140,7 @@ class Assembler:
 
     def ignore_counter(self) -> None:
         """Take SYNC as one without a counter; call it before the first frame."""
-        sync_id, period_ns, _ = self._timing
-        self._timing = sync_id, period_ns, 0
+        self._timing = (*self._timing[:2], 0)
         self._state.bus_state[:, COUNTER] = -1
 
     @property

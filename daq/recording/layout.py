@@ -41,10 +41,7 @@ _FIRST_JOINT = 3
 
 @dataclass(frozen=True)
 class StreamLayout:
-    """Layout of one stream: SYNCs per sample, joints (columns), fields and numpy dtype names of their raw values.
-
-    Raises DataError if a dtype is not supported, or a field has not one scale factor per joint.
-    """
+    """Layout of one stream: SYNCs per sample, joints (columns), fields and numpy dtype names of their raw values."""
 
     name: str
     every: int
@@ -199,10 +196,7 @@ class StreamLayout:
     def pack(
         self, channel_id: int, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> NDArray[Any]:
-        """Return the message records of a batch on an MCAP channel, (N,) in the dtype of :attr:`record`.
-
-        SYNC numbers (N,), their receive times (N,), ns UTC, and raw values (N, n) of every field.
-        """
+        """Return message records (N,) of a batch: SYNC numbers, receive times, ns UTC, raw values (N, n) by field."""
         dtype, template, _ = self.record
         rows = np.frombuffer(bytearray(template * len(sync)), dtype=dtype)
         rows["channel"] = channel_id

@@ -12,11 +12,7 @@ from armident.daq.recording import mcap_records as mcap
 
 @dataclass
 class Summary:
-    """The summary of a file that grows chunk by chunk.
-
-    ``schemas``, ``channels``: bytes of their records. ``chunks``, ``metadata``: index records. ``messages``: number by
-    channel. ``span_ns``: earliest and latest log time, ns; ``None`` without messages.
-    """
+    """The summary of a file that grows chunk by chunk; ``span_ns``: earliest and latest log time, ns."""
 
     schemas: list[bytes] = field(default_factory=list)
     channels: list[bytes] = field(default_factory=list)

@@ -2,10 +2,11 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ class _Events:
     marks: tuple[Mark, ...] = ()
 
 
-class TriggeredSeries:
+class TriggeredSeries(AbstractContextManager["TriggeredSeries", None]):
     """Replacement for :class:`RecordingSeries` that creates files only on a trigger.
 
     ``begin``: creates the files of an event by its number, from 1. Rows from ``before_ns`` before to ``after_ns`` after
@@ -147,9 +148,6 @@ class TriggeredSeries:
         """Close and delete the current file, of a capture that did not begin."""
         if self._series is not None:
             self._series.abort()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         if self._series is not None:

@@ -1,10 +1,10 @@
 """Capture in several files: a new file begins when the current one reaches its size or age; each row is in one file."""
 
-import contextlib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ RETRY_NS = 10_000_000_000
 """Time until the next attempt after a new file could not be created, ns."""
 
 
-class RecordingSeries:
+class RecordingSeries(AbstractContextManager["RecordingSeries", None]):
     """Writes one capture to consecutive files; ConfigError if the first cannot be created.
 
     A file is closed, with its index, after the next one has been created. If that fails (disk full, directory removed),
@@ -121,9 +121,6 @@ class RecordingSeries:
         """Close and delete the current file, of a capture that did not begin."""
         self._writer.abort()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._writer.__exit__(kind, error, at)
 
@@ -145,7 +142,7 @@ class RecordingSeries:
             self._lost_before += writer.lost_rows
         self._problem = writer.problem or self._problem
         counters = {f"{name}.rows": count for name, count in writer.rows.items()}
-        with contextlib.suppress(ConfigError):
+        with suppress(ConfigError):
             writer.close({**counters, "writer.rows_lost": writer.lost_rows})
             return
         self._problem = f"{writer.path}: could not be finished"

@@ -8,10 +8,11 @@ import os
 import secrets
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import zstandard
@@ -50,7 +51,7 @@ _EVENTS = {
 """Topics of events, with the JSON types of their entries."""
 
 
-class RecordingWriter:
+class RecordingWriter(AbstractContextManager["RecordingWriter", None]):
     """Writes a recording to a new file; ConfigError if it cannot be created.
 
     Rows are gathered, written as one zstd chunk with its message indexes per ``chunk_ns``, and synced to the disk: a
@@ -260,9 +261,6 @@ class RecordingWriter:
         """Close and delete the file."""
         self._release()
         self._name.unlink(missing_ok=True)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._release()

@@ -3,11 +3,12 @@
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +90,7 @@ class _Chunk:
         series.flush()
 
 
-class QueuedSeries:
+class QueuedSeries(AbstractContextManager["QueuedSeries", None]):
     """Replacement for the series that it writes to: gathers rows, and a thread writes them chunk by chunk.
 
     A disk that stalls for seconds (worn memory card, busy server) costs memory, no samples. When ``most_bytes`` wait,
@@ -174,10 +175,7 @@ class QueuedSeries:
             self._chunk.since, self._chunk.may_begin_file = t_ns, True
 
     def append(self, rows: Mapping[str, Columns]) -> None:
-        """Add rows of the same time to several streams, which no file divides; the arrays must not change afterwards.
-
-        By stream: SYNC numbers (N,), their receive times (N,), ns UTC, and raw values (N, n) of every field.
-        """
+        """Add rows of the same time to several streams, which no file divides; the arrays must not change later."""
         sizes = {
             stream: sync.nbytes + t_ns.nbytes + sum(values.nbytes for values in raw.values())
             for stream, (sync, t_ns, raw) in rows.items()
@@ -223,9 +221,6 @@ class QueuedSeries:
         """Close and delete the current file, of a capture that did not begin."""
         self._end()
         self._series.abort()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._end()

@@ -2,9 +2,9 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ class _BusState:
         self.traffic = counts_by_length(self.batch[:0])
 
 
-class Receiver:
+class Receiver(AbstractContextManager["Receiver", None]):
     """Reads several buses in turn, each in whole batches.
 
     A bus that goes down or comes back is an event; it is reopened if its interface was removed. Error frames are taken
@@ -200,10 +200,6 @@ class Receiver:
         """Release all buses."""
         for entry in self._buses:
             entry.bus.close()
-
-    def __enter__(self) -> Self:
-        """Use the receiver in a ``with`` block."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Release all buses."""

@@ -10,7 +10,7 @@ import socket
 import struct
 import time
 from collections.abc import Sequence
-from typing import Self
+from contextlib import AbstractContextManager
 
 from armident.configs.errors import ConfigError
 from armident.drivers.can import interface
@@ -58,7 +58,7 @@ _sendmmsg = _libc.sendmmsg
 _sendmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int]
 
 
-class RawSocket:
+class RawSocket(AbstractContextManager["RawSocket", None]):
     """Raw socket on one CAN interface that moves batches of frames; a ConfigError has the command for an administrator.
 
     ``filters``: frames to receive (``None``: all; empty: none, to send only). ``errors``: receive error frames too.
@@ -240,10 +240,6 @@ class RawSocket:
     def close(self) -> None:
         """Release the socket; further calls have no effect."""
         self._socket.close()
-
-    def __enter__(self) -> Self:
-        """Use the socket in a ``with`` block."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Close the socket."""

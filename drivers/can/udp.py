@@ -4,7 +4,8 @@ import os
 import socket
 import time
 from collections.abc import Sequence
-from typing import Any, Self
+from contextlib import AbstractContextManager
+from typing import Any
 
 import can
 import numpy as np
@@ -27,7 +28,7 @@ MULTICAST_ALL = {socket.AF_INET: (socket.IPPROTO_IP, 49), socket.AF_INET6: (sock
 """Option ``MULTICAST_ALL`` by address family (linux/in.h, linux/in6.h): receive also the groups of other sockets."""
 
 
-class UdpBus:
+class UdpBus(AbstractContextManager["UdpBus", None]):
     """Bus over UDP multicast (``239.74.163.2``) like :class:`RawSocket`; receives the frames that it sends itself."""
 
     fd = False
@@ -110,10 +111,6 @@ class UdpBus:
     def close(self) -> None:
         """Release the sockets; further calls have no effect."""
         self._bus.shutdown()
-
-    def __enter__(self) -> Self:
-        """Use the bus in a ``with`` block."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Close the bus."""

@@ -34,11 +34,7 @@ DATA_BITRATES = (2_000_000, 5_000_000, 8_000_000)
 
 
 def frame_bits(data_bytes: int) -> tuple[int, int]:
-    """Minimum and maximum number of bits of a classic frame of n data bytes with an 11-bit identifier.
-
-    ``47 + 8 n`` bits without stuff bits, ``55 + 10 n`` with all possible ones, interframe space included (Davis, Burns,
-    Bril, Lukkien 2007).
-    """
+    """Minimum and maximum number of bits of a classic frame with n data bytes, interframe space included."""
     return 47 + 8 * data_bytes, 55 + 10 * data_bytes
 
 

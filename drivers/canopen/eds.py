@@ -155,10 +155,7 @@ def _flag(text: str | None) -> int | None:
 
 @dataclass(frozen=True)
 class _Cleaner:
-    """Makes sections that canopen reads from those of a file, which have canonical names.
-
-    ``remarks`` receives what is left out; ``configured`` is True for a DCF, whose values are those of one drive.
-    """
+    """Makes sections that canopen reads from those of a file; ``configured``: a DCF, with the values of one drive."""
 
     sections: dict[str, Section]
     remarks: Remarks

@@ -1,6 +1,6 @@
 """Reception of emergency messages without sending anything (listen-only capture)."""
 
-from typing import Self
+from contextlib import AbstractContextManager
 
 from armident.configs.schema.session import SessionConfig
 from armident.drivers.can.filtered_socket import FilteredSocket
@@ -9,7 +9,7 @@ from armident.drivers.canopen.master import DriveEvent
 from armident.drivers.canopen.objects import COB_EMCY
 
 
-class EmcyListener:
+class EmcyListener(AbstractContextManager["EmcyListener", None]):
     """Receives the emergency messages of a session's drives and sends nothing; use it in a ``with`` block."""
 
     def __init__(self, session: SessionConfig) -> None:
@@ -43,10 +43,6 @@ class EmcyListener:
         """Release the sockets."""
         for socket, _ in self._sockets:
             socket.close()
-
-    def __enter__(self) -> Self:
-        """Use the listener in a ``with`` block."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Release the sockets."""

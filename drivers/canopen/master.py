@@ -5,19 +5,20 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Literal
 
 from armident.configs.errors import ArmidentError
 from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.session import DriveNode, SessionConfig
 from armident.drivers.can.frames import BusDown
 from armident.drivers.canopen import objects as od
-from armident.drivers.canopen.cia402_enable import POLL_INTERVAL, enable_drive, hold_position, read_drive_state
+from armident.drivers.canopen.cia402_enable import POLL_INTERVAL, enable_drive, hold_position
 from armident.drivers.canopen.drive_setup import await_mode, check_drive, set_heartbeat, set_sync_counter
 from armident.drivers.canopen.network import NodeNetwork
 from armident.drivers.canopen.node_supervision import NodeSupervision
-from armident.drivers.canopen.objects import Control, DriveState, NmtCommand, NmtState
+from armident.drivers.canopen.objects import Control, NmtCommand, NmtState
 from armident.drivers.canopen.pdo_mapping import map_drive, mapping_differs
 from armident.drivers.canopen.sdo import DriveSdo, NoAnswerError
 
@@ -50,7 +51,7 @@ class DriveEvent:
     code: int = 0
 
 
-class DriveMaster:
+class DriveMaster(AbstractContextManager["DriveMaster", None]):
     """CANopen master of the drives of one session; use it in a ``with`` block.
 
     Call `configure`, `start`, `supervise` regularly, and `stop`. A drive that boots again, or whose mapping another
@@ -165,10 +166,6 @@ class DriveMaster:
         """Position actual values (6064h) over SDO, counts, in the order of the session's drives."""
         return [sdo.read(od.POSITION_ACTUAL, 0, "i") for sdo in self._drives]
 
-    def states(self) -> list[DriveState | None]:
-        """CiA 402 states from the statuswords over SDO, in the order of the session's drives."""
-        return [read_drive_state(sdo) for sdo in self._drives]
-
     def quick_stop(self) -> None:
         """Command a quick stop of every drive that is not lost; raises nothing."""
         self._send_controls((Control.QUICK_STOP,))
@@ -193,10 +190,6 @@ class DriveMaster:
             thread.join()
         for network in self._networks.values():
             network.close()
-
-    def __enter__(self) -> Self:
-        """Use the master in a ``with`` block."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Stop the drives and release the buses."""

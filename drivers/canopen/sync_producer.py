@@ -63,7 +63,6 @@ class SyncStats:
     late_max_us: float
     overruns: int
     skipped: int
-    realtime: bool
     unsent: tuple[int, ...] = ()
 
 
@@ -88,7 +87,6 @@ class SyncProducer:
         self._state[FIRST] = -1
         self._state[WANTED] = np.iinfo(np.int64).max
         self._late = np.zeros(BINS, dtype=np.int64)
-        self._realtime = False
         self._errors = np.zeros(len(self._configured), dtype=np.int64)
         self._unsent = np.zeros(len(self._configured), dtype=np.int64)
         self._times = np.zeros(TIMES, dtype=np.int64)
@@ -160,24 +158,6 @@ class SyncProducer:
     def _over(self) -> bool:
         return bool(self._state[STOP] or self._state[SENT] >= self._state[WANTED])
 
-    @property
-    def first(self) -> int | None:
-        """Number of the SYNC at which row 0 of the set points becomes the target; ``None`` while nothing is played."""
-        first = int(self._state[FIRST])
-        return first if first >= 0 else None
-
-    @property
-    def last(self) -> int | None:
-        """Number of the SYNC at which the last row becomes the target; the demand reaches it ``every`` SYNCs later."""
-        if self.first is None or self._plan is None:
-            return None
-        return self.first + (len(self._plan.rows) - 1) * self._plan.every
-
-    @property
-    def finished(self) -> bool:
-        """``True`` if the demand has reached the last row."""
-        return self.last is not None and self._plan is not None and self.sent > self.last + self._plan.every
-
     def stats(self) -> SyncStats:
         """Punctuality since the start."""
         total = np.cumsum(self._late)
@@ -190,7 +170,6 @@ class SyncProducer:
             late_max_us=float(state[LATE_MAX]) / 1000,
             overruns=int(state[OVERRUNS]),
             skipped=int(state[SKIPPED]),
-            realtime=self._realtime,
             unsent=tuple(int(n) for n in self._unsent),
         )
 
@@ -205,7 +184,7 @@ class SyncProducer:
 
     def _run_compiled(self) -> None:
         assert self._loop is not None
-        self._realtime = set_realtime_priority(REALTIME_PRIORITY)
+        set_realtime_priority(REALTIME_PRIORITY)
         while not self._over:
             self._take_plan()
             rows, cob_ids, every = self._rows()

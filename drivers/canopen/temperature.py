@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 
 from armident.configs.errors import ArmidentError
 from armident.drivers.canopen.sdo import DriveSdo
@@ -15,7 +16,7 @@ REST_S = 60.0
 """Pause after a drive did not answer, s."""
 
 
-class TemperaturePoll:
+class TemperaturePoll(AbstractContextManager["TemperaturePoll", None]):
     """Reads temperatures in a separate thread, one drive at a time; use it in a ``with`` block.
 
     A drive with another SDO transfer in progress waits for its next turn; one that did not answer rests for ``rest_s``.
@@ -38,10 +39,6 @@ class TemperaturePoll:
     def stop(self) -> None:
         """End polling without waiting for the thread."""
         self._over.set()
-
-    def __enter__(self) -> "TemperaturePoll":
-        """Poll in a ``with`` block."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Stop polling and wait for the thread."""

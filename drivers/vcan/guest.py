@@ -56,7 +56,7 @@ def launcher_command(command: Sequence[str], buses: int = 1) -> list[str]:
     return [sys.executable, "-m", "armident.drivers.vcan", "-n", str(buses), "--", *command]
 
 
-def run_in_guest(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable: Sequence[Path] = ()) -> int:
+def run_in_guest(command: Sequence[str], buses: int = 1, memory: str = "4096M") -> int:
     """Run ``command`` in a guest, in the current directory, and return its exit status."""
     if not re.fullmatch(r"\d+[KMG]?", memory):
         raise ArmidentError(f"{memory!r}: expected the memory of a guest as a number with K, M or G, such as 4096M")
@@ -79,7 +79,7 @@ def run_in_guest(command: Sequence[str], buses: int = 1, memory: str = "4096M", 
     with ExitStack() as stack:
         cpu = stack.enter_context(_reserved_cpu())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="armident-vcan-")))
-        _write_scripts(folder, root, command, environment, buses, [folder, Path.cwd(), *caches, *writable])
+        _write_scripts(folder, root, command, environment, buses, [folder, Path.cwd(), *caches])
         _boot(folder, root, cpu, memory)
         try:
             return int((folder / "status").read_text())

@@ -24,11 +24,7 @@ CHUNK = 256
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Amplitudes (G,) over orders (G,), cycles per unit of position, and the noise floor (G,), N m or N.
-
-    ``peaks``: order, amplitude and its standard deviation of each ripple, the largest first. ``levels``: the levels
-    beside these ripples.
-    """
+    """Amplitudes and noise floor (G,), N m or N, over orders (G,), cycles per unit; ``peaks``: the largest first."""
 
     orders: Array
     amplitudes: Array

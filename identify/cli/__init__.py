@@ -27,7 +27,7 @@ def identify(
     config: Robot = None,
     out: OutDirectory = None,
     json: Json = False,
-) -> None:
+) -> int:
     """Identify the dynamic model of a robot from a recording, and judge the result.
 
     Exit code 3 if the verdict is unusable: the reasons stand in the result.
@@ -36,16 +36,14 @@ def identify(
     """
     from armident.identify.cli.result_commands import identify_command
 
-    code = identify_command(recording, config, options, out, as_json=json)
-    if code:
-        raise typer.Exit(code)
+    return identify_command(recording, config, options, out, as_json=json)
 
 
 def check(
     recordings: Annotated[list[Path], typer.Argument(help="Recordings (.mcap) of one robot at one sampling rate.")],
     config: Robot = None,
     json: Json = False,
-) -> None:
+) -> int:
     """Check the set-up in seconds: signs, order of joints, units, gear ratios, gravity, clocks, clipping, standstill.
 
     Prints what is wrong, how sure that is, and the line of configuration that corrects it. Exit code 0 if the set-up
@@ -55,9 +53,7 @@ def check(
     """
     from armident.identify.cli.result_commands import check_command
 
-    code = check_command(recordings, config, as_json=json)
-    if code:
-        raise typer.Exit(code)
+    return check_command(recordings, config, as_json=json)
 
 
 def worker(
@@ -67,7 +63,7 @@ def worker(
         Path | None, typer.Option("--out", help="Folder for the results. [default: the session's recording directory]")
     ] = None,
     since: Annotated[datetime | None, typer.Option(help="Pass over files that were changed before.")] = None,
-) -> None:
+) -> int:
     """Identify every experiment of a cell when its recording ends, and publish the results.
 
     The newest recording comes first. `armident queue` lists what waits, failed, or was passed over.
@@ -76,9 +72,7 @@ def worker(
     """
     from armident.identify.monitoring.worker.worker import run_worker
 
-    code = run_worker(config, once=once, out=out, since=since)
-    if code:
-        raise typer.Exit(code)
+    return run_worker(config, once=once, out=out, since=since)
 
 
 def queue(
@@ -107,7 +101,7 @@ def verify(
         Path | None, typer.Option("--keys", help="Folder with authority.pem. [default: keys of the plant]")
     ] = None,
     json: Json = False,
-) -> None:
+) -> int:
     """Check who signed result documents, in which role and when, and that nobody has changed them since.
 
     Exit code 1 if a document is not signed, was changed, or its signer is not of this plant.
@@ -116,9 +110,7 @@ def verify(
     """
     from armident.identify.documents.signing import verify_command
 
-    code = verify_command(files, keys, as_json=json)
-    if code:
-        raise typer.Exit(code)
+    return verify_command(files, keys, as_json=json)
 
 
 @with_options
@@ -134,7 +126,7 @@ def diagnose(
     ] = None,
     out: OutDirectory = None,
     json: Json = False,
-) -> None:
+) -> int:
     """Find the effects that a model lacks, their size and confidence, and the residual that stays unexplained.
 
     Exit code 4 if there are findings or an unexplained residual. `armident effects` lists the candidates.
@@ -143,9 +135,7 @@ def diagnose(
     """
     from armident.identify.cli.result_commands import diagnose_command
 
-    code = diagnose_command(recordings, config, validate, baseline, options, out, as_json=json)
-    if code:
-        raise typer.Exit(code)
+    return diagnose_command(recordings, config, validate, baseline, options, out, as_json=json)
 
 
 def predict(
@@ -158,7 +148,7 @@ def predict(
     ] = None,
     out: OutDirectory = None,
     json: Json = False,
-) -> None:
+) -> int:
     """Predict the torques of recordings with an identified model, and report its error in total and by joint.
 
     Says if a recording is held out, or one that the model was identified from. Writes prediction.json, torques.csv and
@@ -169,9 +159,7 @@ def predict(
     """
     from armident.identify.cli.result_commands import predict_command
 
-    code = predict_command(recordings, model, config, out, as_json=json)
-    if code:
-        raise typer.Exit(code)
+    return predict_command(recordings, model, config, out, as_json=json)
 
 
 def compare(
@@ -187,7 +175,7 @@ def compare(
         Path | None, typer.Option("--out", help="Folder for the results. [default: comparison, beside the later one]")
     ] = None,
     json: Json = False,
-) -> None:
+) -> int:
     """Compare two identified models of a robot joint by joint, with intervals, and test for a change.
 
     Writes comparison.json and report.html with a plot. Exit code 4 if they differ significantly, 3 if they cannot be
@@ -197,9 +185,7 @@ def compare(
     """
     from armident.identify.cli.result_commands import compare_command
 
-    code = compare_command(baseline, now, out, false_alarms, common=common, as_json=json)
-    if code:
-        raise typer.Exit(code)
+    return compare_command(baseline, now, out, false_alarms, common=common, as_json=json)
 
 
 def effects(
@@ -233,7 +219,7 @@ def history(
         float, typer.Option(min=1e-12, max=0.5, help="Probability of a false alarm per run.")
     ] = 1e-4,
     json: Json = False,
-) -> None:
+) -> int:
     """Keep results in a database, list them, and test for a change of the arm since the first one.
 
     Exit code 4 if the last run differs significantly from the first, in one parameter or in all together. backup FILE
@@ -243,9 +229,7 @@ def history(
     """
     from armident.identify.monitoring.change.history_cli import history_command
 
-    code = history_command(documents or [], database, robot, cell, parameter or [], plot, false_alarms, as_json=json)
-    if code:
-        raise typer.Exit(code)
+    return history_command(documents or [], database, robot, cell, parameter or [], plot, false_alarms, as_json=json)
 
 
 _Sessions = Annotated[

@@ -9,7 +9,7 @@ from scipy import linalg
 
 from armident.arrays import Array
 from armident.configs import DataError
-from armident.identify.regression.ar_noise import ArModel, fit_ar
+from armident.identify.regression.ar_noise import WHITE, ArModel, fit_ar
 from armident.identify.robot.controller import DiscreteController
 
 LENGTHS = (1, 2, 3, 5, 8, 12, 20)
@@ -27,8 +27,6 @@ changes the simulated torques by less than their noise does, and a tap without e
 
 PIECE = 16384
 """Samples of a signal whose products at all lags are formed while they are in the cache: 128 kB."""
-
-NO_FILTER = ArModel(np.empty(0), 1.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,7 @@ def _identify_joint(
     best: tuple[float, JointResponse] | None = None
     # The correlations of the error alone are a part of those of both inputs.
     inputs = [error, motion] if any(structures) else [error]
-    filters = (NO_FILTER, fit_ar(error, PREWHITENING_ORDER))
+    filters = (WHITE, fit_ar(error, PREWHITENING_ORDER))
     correlations = [_correlations(ar, inputs, nu, longest) for ar in filters]
     plain = correlations[0][1]
     power = sum(float(np.sum((b - b.mean()) ** 2)) for b in _held_out(nu, longest))

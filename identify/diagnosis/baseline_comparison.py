@@ -74,11 +74,7 @@ def whitening(covariance: Array) -> Array:
 
 
 def difference_of(baseline: IdentificationDocument, now: IdentificationDocument) -> Difference:
-    """Difference of two identifications.
-
-    Raises DataError for different robots or models; Inconclusive if one is unusable, did not converge, or is far less
-    precise than the other.
-    """
+    """Difference of two identifications; DataError or Inconclusive if they cannot be compared."""
     for name, document in (("the baseline", baseline), ("the identification", now)):
         if not document.converged:
             raise Inconclusive(

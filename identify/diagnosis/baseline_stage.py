@@ -74,10 +74,7 @@ class BaselineStage:
 
 
 def against_baseline(stage: SetupStage, baseline: IdentificationDocument, criteria: Criteria) -> BaselineStage:
-    """Compare the recordings of a diagnosis with a baseline, and explain what has changed.
-
-    Raises DataError if the baseline is of another robot or model.
-    """
+    """Compare recordings with a baseline, and explain what has changed; DataError for another robot or model."""
     robot, experiments = _as_identified(stage.robot, baseline), [*stage.training, *stage.validation]
     # Of a document that is not stored; the test needs the length.
     samples = sum(e.q.shape[0] for e in experiments)

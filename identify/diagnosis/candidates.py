@@ -148,10 +148,7 @@ class ColumnCache:
 
 
 def candidates(column_cache: ColumnCache) -> Iterator[Candidate]:
-    """All effects that the robot does not have at a place yet, and that this motion excites.
-
-    Without effects that only change parameters, and exchanges of signals.
-    """
+    """All effects that the robot lacks and this motion excites, without changes of parameters and exchanged signals."""
     study = column_cache.study
     motion = column_cache.motion(study.train[0], "measured")
     names = study.joints

@@ -167,10 +167,7 @@ def compare(
     robot: RobotConfig | None = None,
     criteria: Criteria | None = None,
 ) -> ParameterChangeTest:
-    """Test two identifications of an arm with the same model for a change of its parameters.
-
-    Changed parameters of a ``robot`` are explained. Raises DataError and Inconclusive as `difference_of`.
-    """
+    """Test two identifications of one model for a change, explained for a ``robot``; raises as `difference_of`."""
     criteria = criteria or Criteria()
     difference = difference_of(baseline, now)
     if "doubtful" in (baseline.verdict, now.verdict) and not same_motion(baseline, now):

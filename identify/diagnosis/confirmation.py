@@ -63,11 +63,6 @@ class Confirmation:
         return min(self.after, self.noiseless, key=lambda errors: float(np.sum(np.log(np.maximum(errors, 1e-300)))))
 
     @property
-    def change(self) -> Array:
-        """Change of the error of each joint where it falls, percent of its torque, (n,)."""
-        return np.asarray(np.sqrt(np.maximum(self.before**2 - self.best**2, 0.0)))
-
-    @property
     def reduction(self) -> float:
         """Mean logarithm of the factors by which the errors of each joint and of the whole arm fall, nats.
 

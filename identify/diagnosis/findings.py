@@ -21,10 +21,7 @@ from armident.identify.effects.wiring import SignalMistake
 
 
 def findings_of(final: ModelState, selected: Sequence[Selected], left: Sequence[Unexplained]) -> list[Finding]:
-    """Return the findings of a selection, in its order; `judged` gives them their probabilities.
-
-    ``selected``: effects of the selection. ``left``: dependences of the residual with them.
-    """
+    """Return the findings of a selection, in order, without probabilities; ``left``: dependences of the residual."""
     deviations = standard_deviations(final)
     entries = list(final.robot.effects)
     values = final.with_values().effects

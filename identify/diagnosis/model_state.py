@@ -1,6 +1,6 @@
 """Model of one step of a diagnosis: the data with its closed loop, the fit, and the predictive score."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -98,8 +98,8 @@ class ModelState:
         """Term of a configuration entry that is no correction of the recordings."""
         return self.terms[[e for e in self.robot.effects if not of_recording(e)].index(entry)]
 
-    def with_values(self, shapes: Mapping[int, Mapping[str, float]] | None = None) -> RobotConfig:
-        """Configuration with the estimated values in its effect entries, or other nonlinear ``shapes`` by entry."""
+    def with_values(self) -> RobotConfig:
+        """Configuration with the estimated values in its effect entries."""
         entries: list[Entry] = list(self.robot.effects)
         for k, entry in enumerate(entries):
             if of_recording(entry):
@@ -107,8 +107,7 @@ class ModelState:
             term = self.term_of(entry)
             values, _ = self.values_of(term)
             linear = {p.name: float(value) for p, value in zip(term.linear, values, strict=True)}
-            found = {**term.shapes, **linear, **dict((shapes or {}).get(k, {}))}
-            entries[k] = entry.model_copy(update={"parameters": found})
+            entries[k] = entry.model_copy(update={"parameters": {**term.shapes, **linear}})
         return self.robot.model_copy(update={"effects": tuple(entries)})
 
 

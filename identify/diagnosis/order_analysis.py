@@ -22,13 +22,11 @@ PEAKS = 3
 """Most orders returned."""
 
 
-def strongest_orders(
-    angle: Sequence[Array], residual: Sequence[Array], highest: float, lowest: float = 0.0
-) -> list[tuple[float, float]]:
+def strongest_orders(angle: Sequence[Array], residual: Sequence[Array], highest: float) -> list[tuple[float, float]]:
     """Return the `PEAKS` strongest orders, cycles per 2 pi of the angle, with power over the neighbourhood's median."""
     low = min(float(a.min()) for a in angle)
     span = max(float(a.max()) for a in angle) - low
-    if span <= 0.0 or highest <= lowest:
+    if span <= 0.0 or highest <= 0.0:
         return []
     bins = int(np.ceil(2 * OVERSAMPLING * highest * span / (2 * np.pi))) + 1
     width = span / bins
@@ -39,7 +37,7 @@ def strongest_orders(
         power += np.abs(np.fft.rfft(np.bincount(number, e, minlength=bins), size)) ** 2
     orders = np.arange(power.size) * (2 * np.pi / (size * width))
     apart = 2 * np.pi / span
-    inside = np.flatnonzero((orders >= max(lowest, 2 * apart)) & (orders <= highest))
+    inside = np.flatnonzero((orders >= 2 * apart) & (orders <= highest))
     if inside.size < 3:
         return []
     own = power[inside]
@@ -60,7 +58,7 @@ def motor_orders(study: Study, theta: Array, motor: int) -> tuple[Shapes, ...]:
     """Return the orders of the strongest ripples of a residual over the angle of a motor, as a grid of an effect."""
     ratios = study.robot.transmission_matrix[motor]
     joint = int(np.argmax(np.abs(ratios)))
-    residual = [s.torque[:, joint] - study.torques(s, "measured", theta)[:, joint] for s in study.train]
+    residual = [study.residual(s, theta)[:, joint] for s in study.train]
     angles = [s.measured.q @ ratios for s in study.train]
     speed = np.concatenate([np.abs(s.measured.qd @ ratios) for s in study.train])
     moving = speed[speed > STANDSTILL * speed.max()]

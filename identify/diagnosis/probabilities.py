@@ -120,10 +120,7 @@ def _rest(odds: Mapping[str, float], shares: Mapping[str, float], temper: float)
 def judged(
     findings: Sequence[Finding], left: Sequence[Unexplained], joints: Sequence[str], known: Calibration
 ) -> tuple[list[Finding], list[Explanation]]:
-    """Return the findings with their probabilities, and what may be missing at each joint.
-
-    ``findings``: those of the set-up and of changes among them. ``left``: unexplained dependences.
-    """
+    """Return the findings, set-up and changes included, with probabilities, and what may be missing at each joint."""
     entries: list[Explanation] = []
     probable = []
     for finding in findings:

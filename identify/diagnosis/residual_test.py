@@ -32,10 +32,7 @@ NOT_COMPARED = (
 
 @dataclass(frozen=True)
 class ResidualChange:
-    """Test of one property of the residuals of one joint, by chi-square or, of ``power``, by a ratio of powers.
-
-    ``p_value``: probability without a change, corrected by Holm's method for all joints and kinds.
-    """
+    """Test of one property of a joint's residuals, by chi-square or a ratio of powers; p-value corrected by Holm."""
 
     joint: str
     kind: Literal["position", "velocity", "power"]

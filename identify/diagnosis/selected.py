@@ -13,10 +13,7 @@ from armident.identify.effects.recording_corrections import of_recording
 
 @dataclass(frozen=True, eq=False)
 class Selected:
-    """A selected effect, with the step in which it was compared without it in the model.
-
-    ``confirmation``, ``without``: comparison with the final model without it, and that model; ``None`` before.
-    """
+    """A selected effect with its step; ``confirmation``: of the final model over that ``without`` it."""
 
     entry: Entry
     step: SelectionStep

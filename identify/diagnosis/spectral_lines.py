@@ -7,7 +7,6 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from armident.arrays import Array
-from armident.identify.diagnosis.stretch import MotionStretch
 from armident.identify.diagnosis.study import Study
 from armident.identify.identification.options import CONTROLLERS
 from armident.identify.signals.periodogram import hann_window, periodogram
@@ -52,11 +51,6 @@ class SpectralLine:
         return float(chdtrc(4, -2.0 * sum(np.log(max(p, 1e-300)) for p in (self.p_train, self.p_held))))
 
 
-def working_rate_residuals(study: Study, stretches: Sequence[MotionStretch], theta: Array) -> list[Array]:
-    """Torques less those of the model at the working rate, (N, n) each, N m or N."""
-    return [s.torque - study.torques(s, "measured", theta) for s in stretches]
-
-
 def bandwidth_of_motion(study: Study) -> float:
     """Bandwidth of the motion, Hz; below it the repeatable part of the residual has lines, too."""
     return 0.5 / (study.dt * study.decimation.factor * study.criteria.band)
@@ -64,7 +58,7 @@ def bandwidth_of_motion(study: Study) -> float:
 
 def lines_of_joints(study: Study, theta: Array) -> Iterator[tuple[int, SpectralLine]]:
     """Strongest line of each joint above the frequencies of the motion that the references do not contain."""
-    train, held = (working_rate_residuals(study, part, theta) for part in (study.train, study.held))
+    train, held = ([study.residual(s, theta) for s in part] for part in (study.train, study.held))
     lowest = bandwidth_of_motion(study)
     for j in range(study.robot.n):
         line = strongest_line([e[:, j] for e in train], [e[:, j] for e in held], study.dt, lowest)

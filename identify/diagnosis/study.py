@@ -187,11 +187,11 @@ class Study:
         motion = self.motion(stretch, kind, theta)
         return self.model.term_regressor(motion)[motion.lead :]
 
-    def torques(self, stretch: MotionStretch, kind: str, theta: Array) -> Array:
-        """Torques (N, n) of the model along a stretch, terms included, N m or N."""
-        signals: Derivatives = getattr(stretch, kind)
-        rigid = self.model.inverse_dynamics(theta, signals.q, signals.qd, signals.qdd)
-        return rigid + self.terms(stretch, kind, theta) @ theta[-self.model.e :] if self.model.e else rigid
+    def residual(self, stretch: MotionStretch, theta: Array) -> Array:
+        """Torques less those of the model with its terms, at the working rate, (N, n), N m or N."""
+        motion, e = stretch.measured, self.model.e
+        rigid = self.model.inverse_dynamics(theta, motion.q, motion.qd, motion.qdd)
+        return stretch.torque - (rigid + self.terms(stretch, "measured", theta) @ theta[-e:] if e else rigid)
 
     def resimulated(self, theta: Array) -> "Study":
         """The study with the closed-loop motion of its model at ``theta`` (b,), except experiments held out altogether.
@@ -264,7 +264,6 @@ def build_study(
     training: Sequence[Experiment],
     validation: Sequence[Experiment],
     robot: RobotConfig,
-    known_signals: Sequence[Derivatives] | None = None,
     criteria: Criteria | None = None,
 ) -> Study:
     """Differentiate, simulate, split and filter the experiments; without ``validation`` their last part is held out."""
@@ -281,9 +280,7 @@ def build_study(
     factor = max(1, int(1.0 / (dt * WORKING_RATE * cutoff)))
     first = design(dt, 0.4 / (dt * factor), factor) if factor > 1 else design(dt, 0.5 / dt, 1)
     second = design(dt * factor, cutoff)
-    signals = known_signals or [
-        replace(differentiate(e.q, dt, bandwidth_hz=bandwidth), start=e.start) for e in experiments
-    ]
+    signals = [replace(differentiate(e.q, dt, bandwidth_hz=bandwidth), start=e.start) for e in experiments]
     simulated, loop, auxiliary, warnings = _simulated(model, experiments, signals, bandwidth)
     warnings += unsaturated_joints(given, robot, speeds)
     slowest = 1.0 / np.asarray(robot.sign_smoothing)

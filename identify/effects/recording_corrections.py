@@ -12,10 +12,7 @@ from armident.identify.signals.streamed import kept
 
 
 def of_recording(entry: Entry) -> bool:
-    """Return True if an effect entry corrects the recordings instead of being a term of the model.
-
-    Wiring errors always do; torque corrections (gain, delay, lag, saturation) only if the entry gives the value.
-    """
+    """Return True if an entry corrects the recordings: wiring errors always, torque corrections if it has the value."""
     return of_entry(entry).corrects(entry)
 
 

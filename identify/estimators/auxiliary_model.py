@@ -41,10 +41,7 @@ class _Diverged(Exception):
 
 @dataclass(frozen=True)
 class Response:
-    """Response of the simulated loop, filtered and decimated like the equations.
-
-    ``torque``, ``position``: one (M, n) array per experiment, N m or N, rad or m.
-    """
+    """Filtered response of the simulated loop: torques, N m or N, and positions, rad or m, (M, n) per experiment."""
 
     torque: tuple[Array, ...]
     position: tuple[Array, ...]
@@ -174,10 +171,7 @@ class AuxiliaryModel:
             return list(pool.map(self.respond, thetas))
 
     def instruments(self, theta: Array) -> Sequence[Array]:
-        """Filtered regressor at few samples of simulated signals, one (M, n, b) per experiment.
-
-        Raises DataError if no point between theta and the last good estimate can be simulated.
-        """
+        """Filtered regressor at few simulated samples, (M, n, b) per experiment; DataError if no loop runs."""
         return self.regressors(self.motions(theta), thinned=True)
 
     def motions(self, theta: Array) -> Sequence[Derivatives]:
@@ -190,15 +184,7 @@ class AuxiliaryModel:
         return mapped(lambda run, start: Derivatives(run.q, run.qd, run.qdd, None, self.dt, start), runs, starts)
 
     def regressors(self, motions: Sequence[Derivatives], *, thinned: bool = False) -> Sequence[Array]:
-        """Filtered regressor at noise-free motions, one (M, n, b) per experiment.
-
-        Parameters
-        ----------
-        motions
-            Signals of every experiment.
-        thinned
-            Compute it at few samples, which is enough for instruments.
-        """
+        """Filtered regressor at noise-free motions, (M, n, b) per experiment; ``thinned``: few samples suffice."""
         regressor = thinned_regressor if thinned else filtered_regressor
         seen = (self._in_band(motion, k) for k, motion in enumerate(motions))
         return kept((regressor(self.model, motion, self.decimation) for motion in seen), like=motions)

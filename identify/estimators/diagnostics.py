@@ -80,20 +80,18 @@ def diagnose_estimate(
     instruments: Sequence[Array] | None = None,
     weights: Sequence[ArModel] | None = None,
     essential: NDArray[np.bool_] | None = None,
-    max_order: int = MAX_AR_ORDER,
 ) -> Diagnostics:
     """Test an estimate with its equations; ValueError if shapes do not belong together.
 
     ``instruments``: regressor (M, n, b) at simulated signals at the final theta; ``None``: least squares. ``weights``:
     noise models of the rows, those of the estimate by default; they differ where a model entered the covariance alone.
-    ``essential``: mask (b,) for the F test. ``max_order``: of noise models of the residuals where the weights have
-    none.
+    ``essential``: mask (b,) for the F test.
     """
     _check(names, joints, blocks, instruments)
     weights = list(weights or estimate.noise)
     noise = weights
     if not any(w.order for w in weights):
-        noise = noise_models(blocks, estimate.theta, estimate.covariance, max_order)
+        noise = noise_models(blocks, estimate.theta, estimate.covariance, MAX_AR_ORDER)
     keep, x = [b.keep for b in blocks], [b.x for b in blocks]
     rows = whitened(x, weights, keep)
     condition, relevance, endogeneity, ratio = None, None, None, 1.0
@@ -120,10 +118,7 @@ def diagnose_estimate(
 
 
 def nested_f_test(theta: Array, covariance: Array, kept: NDArray[np.bool_], equations: int) -> NestedFit:
-    """F test that all parameters but the kept ones, mask (b,), are zero together; ``equations``: number of rows.
-
-    For least squares it is the ratio of the sums of squares of the two fits; for instruments the Wald form of it.
-    """
+    """F test (least squares), or its Wald form, that all parameters but those of the mask (b,) are zero together."""
     out = np.flatnonzero(~kept)
     degrees = (out.size, max(equations - theta.size, 1))
     if out.size == 0:

@@ -7,24 +7,19 @@ import numpy as np
 from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.problem import Estimator, Solved
-from armident.identify.estimators.sensitivity import torque_sensitivities
 from armident.identify.regression.equations import (
     Estimate,
     ExperimentEquations,
     joint_variances,
     residual_norm,
-    stacked,
     stacked_parts,
     whitened_residuals,
 )
 from armident.identify.regression.iterations import Iterations, iterate
-from armident.identify.regression.iv import factored
 from armident.identify.regression.least_squares import Triangle
 
 
-def didim(
-    blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array, *, true_sensitivities: bool = False
-) -> Estimate:
+def didim(blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array) -> Estimate:
     """Iterate least squares of the measured torque on the simulated regressor (2.36).
 
     Parameters
@@ -35,8 +30,6 @@ def didim(
         The simulated closed loop with the true controller; its regressor passes the same filter.
     start
         First theta of the auxiliary model, shape (b,).
-    true_sensitivities
-        Covariance with the Jacobian of the simulated torque, for b more simulations.
 
     Notes
     -----
@@ -52,11 +45,7 @@ def didim(
     auxiliary = auxiliary.fresh()
     (theta, done, converged, reason), simulated = solve_didim(blocks, auxiliary, start)
     noise = joint_variances(simulated, theta)
-    if true_sensitivities:
-        z, y = stacked(simulated, noise)
-        covariance = factored(z, torque_sensitivities(auxiliary, theta, blocks, noise), y).covariance
-    else:
-        covariance = Triangle.of(stacked_parts(simulated, noise)).inverse_gram  # 2.37
+    covariance = Triangle.of(stacked_parts(simulated, noise)).inverse_gram  # 2.37
     residuals = whitened_residuals(simulated, theta, noise)
     return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.warnings)
 
@@ -64,10 +53,7 @@ def didim(
 def solve_didim(
     blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: Array
 ) -> tuple[Iterations, Sequence[ExperimentEquations]]:
-    """Iterations of DIDIM (2.36), and the equations of every experiment simulated at their last theta.
-
-    Raises DataError if no auxiliary model runs, not even the first.
-    """
+    """Iterations of DIDIM (2.36), and the equations simulated at their last theta; DataError if no loop runs."""
     scale = noise = joint_variances(blocks, np.zeros_like(start))
 
     def step(previous: Array, _: int) -> tuple[Array, float]:

@@ -36,10 +36,7 @@ class MotionInstruments(AuxiliaryModel):
         return cls(model, controller, motion, at_rest, dt, decimation, np.full(model.n, np.inf), feedback=False)
 
     def simulate(self, theta: Array, disturbances: Sequence[Array] | None = None) -> Sequence[Simulation] | None:
-        """The motion of every experiment, with the torques that base parameters (b,) need for it.
-
-        ``disturbances`` have no effect: the motion is given.
-        """
+        """The motion, which is given, with the torques that theta (b,) needs; ``disturbances`` have no effect."""
         if not np.isfinite(theta).all():
             return None
 

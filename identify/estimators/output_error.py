@@ -41,8 +41,7 @@ def output_error(
     A start as poor as CAD values is first brought near by pseudo-linear regression (4.22), one simulation per
     iteration. Then Gauss-Newton steps with finite-difference sensitivities; Levenberg-Marquardt damping where one does
     not lower the error or leads where the loop cannot be simulated. Weights 2.24 to 2.26 are those of the last
-    residuals. ``auxiliary``: not yet used by another estimator. Raises DataError if no loop near ``start`` (b,) can be
-    simulated.
+    residuals. ``auxiliary``: not yet used by another estimator.
     """
     search = _approach(signal, measured, blocks, auxiliary, start)
     scale = search.variances()

@@ -15,10 +15,7 @@ DIAGNOSE = "armident diagnose RECORDING"
 
 @dataclass(frozen=True)
 class Reason:
-    """One defect of a result: level of its verdict, a sentence with figures, and the action that removes it.
-
-    ``joint``: ``None`` for several, or none in particular. ``kind``: property that was judged.
-    """
+    """One defect of a result: verdict, message, remedy; ``joint``: ``None`` for several; ``kind``: property judged."""
 
     level: Level
     message: str

@@ -109,10 +109,7 @@ def ljung_box(
 
 
 def breusch_pagan(residuals: Array, magnitudes: Array) -> tuple[float, int, float]:
-    """Test of Breusch and Pagan in Koenker's (1981) form, valid without normality: ``M R^2`` of the squares.
-
-    White residuals (M,) against magnitudes (M, k) to statistic, degrees of freedom and p-value.
-    """
+    """Koenker's (1981) form of Breusch and Pagan's test, valid without normality: statistic, degrees of freedom, p."""
     squares = residuals**2
     centred = magnitudes - magnitudes.mean(axis=0)
     u, singular, _ = np.linalg.svd(

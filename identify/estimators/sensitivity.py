@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from armident.arrays import Array
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel, Response
 from armident.identify.regression.ar_noise import ArModel, ar_models
-from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.regression.least_squares import column_norms
 from armident.identify.regression.whitening import whitened
 
@@ -44,11 +43,7 @@ def sensitivities(auxiliary: AuxiliaryModel, theta: Array, response: Response, s
 
 
 def difference_steps(zeta: Arrays, torques: Arrays, errors: Arrays, keep: Sequence[NDArray[np.bool_]]) -> Array:
-    """Finite-difference steps (b,) on the scale of each parameter's standard deviation.
-
-    Per experiment, ``zeta``: filtered regressor at simulated signals (M, n, b); torques and their unexplained part (M,
-    n), N m or N; equations to keep (M, n).
-    """
+    """Finite-difference steps (b,) on the scale of each parameter's standard deviation, by instruments (M, n, b)."""
     noise = [
         ArModel(np.empty(0), max(e.variance, LEAST_TORQUE**2 * y.variance), 0.0)
         for e, y in zip(ar_models(errors, 0, keep=keep), ar_models(torques, 0, keep=keep), strict=True)
@@ -57,10 +52,7 @@ def difference_steps(zeta: Arrays, torques: Arrays, errors: Arrays, keep: Sequen
 
 
 def weighted_columns(columns: Sequence[Arrays], keep: Sequence[NDArray[np.bool_]], noise: Sequence[ArModel]) -> Array:
-    """Jacobian of 4.2 and 4.4 (rows, b): each column stacked joint by joint and weighted.
-
-    ``columns``: by parameter, its derivatives (M, n) by experiment; ``noise``: models of the joints.
-    """
+    """Jacobian (rows, b) of 4.2 and 4.4, whitened; ``columns``: derivatives (M, n) by parameter and experiment."""
     return np.stack([whitened(column, noise, keep) for column in columns], axis=1)
 
 
@@ -69,15 +61,3 @@ def _quotient(moved: Response, response: Response, step: float) -> Response:
         tuple((a - b) / step for a, b in zip(moved.torque, response.torque, strict=True)),
         tuple((a - b) / step for a, b in zip(moved.position, response.position, strict=True)),
     )
-
-
-def torque_sensitivities(
-    auxiliary: AuxiliaryModel, theta: Array, blocks: Sequence[ExperimentEquations], noise: Sequence[ArModel]
-) -> Array:
-    """Weighted Jacobian (rows, b) of the simulated torque (4.4); DataError if no simulation near theta runs."""
-    theta, response = auxiliary.reachable(theta)
-    torques, keep = [b.y for b in blocks], [b.keep for b in blocks]
-    errors = [y - t for y, t in zip(torques, response.torque, strict=True)]
-    steps = difference_steps(auxiliary.regressors(auxiliary.motions(theta)), torques, errors, keep)
-    columns = sensitivities(auxiliary, theta, response, steps)
-    return weighted_columns([column.torque for column in columns], keep, noise)

@@ -75,10 +75,7 @@ class _Body:
 
 
 class CollisionModel:
-    """Pairs of bodies of an arm and its cell; ConfigError if a box contains the arm in nearly every posture.
-
-    ``geometry``: capsules, in frames j, for links without given ones.
-    """
+    """Pairs of bodies of an arm and its cell; ``geometry``: capsules, in frames j, of links without given ones."""
 
     def __init__(self, robot: RobotConfig, geometry: Sequence[LinkCapsule] = ()) -> None:
         self.settings = robot.collision or Collision()

@@ -89,8 +89,7 @@ def design_trajectory(
     ``duration`` (s) is met within a millisecond. ``noise``: standard deviations (n,) of the filtered torque noise, the
     weight; by default proportional to the torque limits. ``evaluations``: number of candidates. ``margin``: usable
     share of each limit. ``theta``: standard or base parameters, so that torques stay within limits. ``aim``: effects to
-    make visible. ``shape``: trapezoidal ``moves`` or a ``fourier`` series of ``harmonics``. Raises ConfigError if no
-    move or no candidate keeps the limits.
+    make visible. ``shape``: trapezoidal ``moves`` or a ``fourier`` series of ``harmonics``.
     """
     robot.check_movable()
     model = arm_model(robot)
@@ -196,7 +195,6 @@ def predict_precision(
     trajectory: Trajectory,
     noise: ArrayLike,
     *,
-    cutoff_hz: float = CUTOFF,
     known_noise: bool = True,
     theta: ArrayLike | None = None,
     aim: EffectObjective | None = None,
@@ -205,21 +203,21 @@ def predict_precision(
     """Predict condition number and standard deviations of an identification along a trajectory.
 
     ``noise``: of the filtered torques (n,), N m or N; without ``known_noise`` only a weight, so no standard deviations.
-    ``cutoff_hz``: low-pass; one sample per independent interval is kept (thesis section 2.3.2).
+    After the low-pass, one sample per independent interval is kept (thesis section 2.3.2).
     """
     period = PERIOD
     q, qd, qdd = sample_trajectory(trajectory, period)
     torque = None if theta is None else predicted_torque(model, theta, q, qd, qdd, period)
     x = model.base_regressor(q, qd, qdd, dt=period)
-    keep = max(1, round(0.5 / (cutoff_hz * period)))
-    sections = butter(4, 2.0 * cutoff_hz * period, output="sos")
+    keep = max(1, round(0.5 / (CUTOFF * period)))
+    sections = butter(4, 2.0 * CUTOFF * period, output="sos")
     x = sosfiltfilt(sections, x, axis=0)[keep // 2 :: keep] / np.asarray(noise, dtype=np.float64)[:, None]
     flat = x.reshape(-1, x.shape[2])
     _, singular, right = np.linalg.svd(flat, full_matrices=False)
     std = np.sqrt(((right / singular[:, None]) ** 2).sum(axis=0)) if known_noise else None
     wanted = None
     if aim is not None and known_noise:
-        decimation = design(period, cutoff_hz, keep)
+        decimation = design(period, CUTOFF, keep)
         motion = (model if theta is None else model.anchored(theta)).motion(q, qd, qdd, period)
         wanted = aim.std(motion, *equations_of(model, motion, decimation, np.asarray(noise, dtype=np.float64)))
     closest = None if collision is None else collision.closest(q)

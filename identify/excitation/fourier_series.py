@@ -27,10 +27,7 @@ DIGITS = 7
 
 @dataclass(frozen=True)
 class FourierSeries:
-    """Candidate: sine and cosine ``coefficients`` (2, H, n) before scaling to the limits.
-
-    ``share`` (n,) of the amplitude that the limits allow; ``middle`` (n,) of the motion in the free range, 0 to 1.
-    """
+    """Sine and cosine ``coefficients`` (2, H, n), ``share`` (n,) of the amplitude, ``middle`` (n,) in the range."""
 
     coefficients: Array
     share: Array

@@ -45,10 +45,7 @@ class EffectObjective:
     pairs: tuple[tuple[EffectLocation, EffectLocation | None], ...]
 
     def cost(self, motion: Motion, x: Array, decimation: Decimation, sigma: Array) -> float:
-        """Return the mean log standard deviation of all linear parameters (D-optimality); lower is better.
-
-        ``x``: weighted base regressor (M n, b) at the instants that the decimation keeps; ``sigma``: torque noise (n,).
-        """
+        """Return the mean log standard deviation of all linear parameters, by the weighted base regressor (M n, b)."""
         values = []
         for location, rival in self.pairs:
             for shapes in location.shapes:

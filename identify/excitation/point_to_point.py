@@ -75,11 +75,7 @@ MISS_UNIT = 0.01
 
 
 class Rank(NamedTuple):
-    """Rank of a candidate, smaller is better: ``violation`` of limits first, then ``cost``.
-
-    ``violation``: relative excess of torque plus missing distance in `MISS_UNIT`. ``cost``: mean log std with
-    penalties.
-    """
+    """Rank of a candidate, smaller is better: relative excess over the limits first, then mean log std."""
 
     violation: float
     cost: float
@@ -292,10 +288,7 @@ def predicted_torque(model: ArmModel, theta: ArrayLike, q: Array, qd: Array, qdd
 
 
 def torque_deviation(model: ArmModel, covariance: Array, q: Array, qd: Array, qdd: Array, period: float) -> Array:
-    """Return the standard deviations (N, n) of torques predicted along a motion, N m or N.
-
-    ``model``: anchored where terms depend on its torques; ``covariance`` (b, b): of its base parameters.
-    """
+    """Return standard deviations (N, n) of predicted torques, N m or N; ``covariance`` (b, b) of the parameters."""
     x = model.base_regressor(q, qd, qdd, dt=period)
     result: Array = np.sqrt(np.maximum(np.einsum("kjb,kjb->kj", x @ covariance, x), 0.0))
     return result

@@ -137,10 +137,7 @@ def check_safety(robot: RobotConfig, design: Design, safety: SafetyModel) -> Saf
 
 @dataclass(frozen=True, eq=False)
 class CheckedTrajectory:
-    """Result of ``armident trajectory``; ``excess``: limits that an existing trajectory exceeds.
-
-    ``std``: predicted standard deviations of the base parameters (b,), SI; without ``prior``, of an assumed noise.
-    """
+    """Result of ``armident trajectory``; ``excess``: limits exceeded; ``std``: of the base parameters (b,), SI."""
 
     robot: RobotConfig
     path: Path | None

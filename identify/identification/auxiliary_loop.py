@@ -41,10 +41,7 @@ NOT_LIKE_THE_ROBOT = (
 
 
 class ClosedLoop(NamedTuple):
-    """The simulated closed loop of an estimator, first theta (b,), and why a preferred controller was not used.
-
-    ``controller``: as in the document, with the error of the simulated velocities, percent.
-    """
+    """The simulated closed loop of an estimator, first theta (b,), and why a preferred controller was not used."""
 
     auxiliary: AuxiliaryModel
     start: Array

@@ -20,10 +20,7 @@ SINGULAR = 1e-12
 
 
 def held_out_errors(blocks: Sequence[ExperimentEquations], theta: Array) -> tuple[float, Array] | None:
-    """``|y - X theta| / |y|`` in percent on held-out parts, overall and per joint (n,); ``None`` if undetermined.
-
-    Parts are stretches, as noise is correlated; residuals of ``theta`` (b,), SI, weigh the least squares.
-    """
+    """``|y - X theta| / |y|``, percent, on held-out stretches, overall and per joint (n,); ``None`` if undetermined."""
     # Blocks of a long recording are on disk: one at a time is in memory.
     n = len(blocks[0].y[0])
     squares, used = np.zeros(n), np.zeros(n)

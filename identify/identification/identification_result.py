@@ -77,7 +77,6 @@ class IdentificationResult:
     warnings: tuple[str, ...]
     options: Options
     idim_ls: tuple[Array, Array]
-    idim_ls_relative_error_pct: float
     t: Array
     tau_measured: Array
     tau_predicted: Array
@@ -183,7 +182,6 @@ def make_result(
         warnings=tuple(dict.fromkeys(warnings)),
         options=options,
         idim_ls=(ls.estimate.theta, ls.estimate.std),
-        idim_ls_relative_error_pct=relative_torque_errors(ls_blocks, ls.estimate.theta)[0],
         t=np.concatenate([b.t for b in ls_blocks]),
         tau_measured=np.concatenate([b.y for b in ls_blocks]),
         tau_predicted=np.concatenate([b.x @ estimate.theta for b in ls_blocks]),

@@ -68,11 +68,7 @@ class JointResidualStatistics:
 
 @dataclass(frozen=True)
 class EffectDirection:
-    """Change of the estimate by an effect that the model lacks, per unit of its m linear parameters.
-
-    ``parameters`` (m, b): of the parameters, which absorb a part of it; ``scores`` (n, m, k): of the scores of each
-    joint, which show the rest.
-    """
+    """Change by an effect that the model lacks, per linear parameter: ``parameters`` (m, b), ``scores`` (n, m, k)."""
 
     effect: str
     joint: str

@@ -186,10 +186,7 @@ def atan_sign(x: Array) -> Array:
 
 
 class _Profile:
-    """Sum of squares of a joint's equations over the width of its smoothed sign, the other parameters free.
-
-    ``j``: joint; ``column``: its Coulomb friction; ``noise``: noise model of the equations.
-    """
+    """Sum of squares of joint j's equations over the width of its smoothed sign, the other parameters free."""
 
     def __init__(self, prepared: Prepared, used: Decimation, j: int, column: int, noise: ArModel = WHITE) -> None:
         every = prepared.equations(used)

@@ -56,10 +56,7 @@ FEW, MANY = 2, 12
 
 @dataclass(frozen=True)
 class SimulatedBias:
-    """Mean bias (b,) of simulated recordings and scatter (b,) by encoder noise, SI.
-
-    ``share``: of the experiments that were simulated; the scatter of all is smaller by its square root.
-    """
+    """Mean bias (b,) of simulated recordings, and scatter (b,) by encoder noise, SI; ``share``: of the experiments."""
 
     bias: Array
     scatter: Array
@@ -84,11 +81,7 @@ def simulated_bias(
     runs: int | None = None,
     share: float = 1.0,
 ) -> SimulatedBias | None:
-    """Bias of an instrumental-variable estimate; ``None`` if its loop fails or leaves parameters undetermined.
-
-    ``weights``: noise models of the joints; ``share``: of experiments simulated; ``runs``: few if irrelevant, else
-    many.
-    """
+    """Bias of an instrumental-variable estimate; ``None`` if its loop fails; ``share``: of experiments simulated."""
     auxiliary, theta = auxiliary.fresh(), estimate.theta
     clean = auxiliary.simulate(theta)
     if clean is None:
@@ -110,7 +103,8 @@ def simulated_bias(
         if not np.isfinite(found).all():
             return None
         errors.append(found - theta)
-        if runs is None and len(errors) == FEW and not _relevant(errors, estimate):
+        relevant = np.abs(np.mean(errors, axis=0)) > IdentificationCriteria.max_bias_std * estimate.std
+        if runs is None and len(errors) == FEW and not relevant.any():
             break
     return SimulatedBias(np.mean(errors, axis=0), np.std(errors, axis=0, ddof=1), len(errors), share)
 
@@ -129,10 +123,6 @@ def corrected(estimate: Estimate, found: SimulatedBias, blocks: Sequence[Experim
     )
     residuals = whitened_residuals(blocks, theta, estimate.noise)
     return replace(estimate, theta=theta, covariance=covariance, residuals=residuals)
-
-
-def _relevant(errors: Sequence[Array], estimate: Estimate) -> bool:
-    return bool(np.any(np.abs(np.mean(errors, axis=0)) > IdentificationCriteria.max_bias_std * estimate.std))
 
 
 def _recorded(

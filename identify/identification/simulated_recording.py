@@ -15,8 +15,7 @@ from armident.identify.signals.bandwidth import motion_bandwidth
 def simulate_model(model: RobotModel, trajectory: Trajectory, rate_hz: float | None = None) -> Recording:
     """Simulate the recording of an arm that is exactly the model, with its effects, without noise; SI, joint side.
 
-    Dynamics: thesis section B.3; controller: known, else a critically damped PD. Raises ConfigError or DataError if the
-    trajectory leaves the limits or the loop diverges.
+    Dynamics: thesis section B.3; controller: known, else a critically damped PD.
     """
     robot, arm = model.robot, model.arm
     trajectory.check(robot)

@@ -49,17 +49,11 @@ class TorqueDelay:
 
     samples: Array
     std: Array
-    dt: float
     instrumented: bool
 
-    @property
-    def seconds(self) -> Array:
-        """Delays in seconds, shape (n,)."""
-        return self.samples * self.dt
-
-    def contradicts(self, expected: float = HELD, deviations: float = 3.0) -> NDArray[np.bool_]:
-        """Mask (n,) of the joints whose delay differs from an expected one, samples, by some standard deviations."""
-        contradiction: NDArray[np.bool_] = np.abs(self.samples - expected) > deviations * self.std
+    def contradicts(self) -> NDArray[np.bool_]:
+        """Mask (n,) of the joints whose delay differs from a held torque by more than three standard deviations."""
+        contradiction: NDArray[np.bool_] = np.abs(self.samples - HELD) > 3.0 * self.std
         return contradiction
 
 
@@ -84,7 +78,9 @@ def torque_delay(
     joints = np.arange(n)
 
     def augmented(motions: Sequence[Derivatives], known: Sequence[Array]) -> list[Array]:
-        return [_with_delays(value) for value in known or [filtered_regressor(model, s, decimation) for s in motions]]
+        found = known or [filtered_regressor(model, s, decimation) for s in motions]
+        # An empty column for the delay of every joint.
+        return [np.concatenate([value, np.zeros((*value.shape[:2], n))], axis=2) for value in found]
 
     x = augmented(signals, regressors[0])
     z = augmented(instruments, regressors[1]) if instrumented else x
@@ -112,12 +108,7 @@ def torque_delay(
     covariance = serial_covariance(z, x, keep, noise, noise)
     coloured = noise_models(blocks, theta, covariance, DELAY_AR_ORDER)
     covariance = serial_covariance(z, x, keep, noise, coloured)
-    return TorqueDelay(theta[b:], np.sqrt(np.diag(covariance)[b:]), experiments[0].dt, instrumented)
-
-
-def _with_delays(x: Array) -> Array:
-    """Regressor (M, n, b) with an empty column for every joint's delay, (M, n, b + n)."""
-    return np.concatenate([x, np.zeros((*x.shape[:2], x.shape[1]))], axis=2)
+    return TorqueDelay(theta[b:], np.sqrt(np.diag(covariance)[b:]), instrumented)
 
 
 def _rate(model: ArmModel, s: Derivatives, theta: Array, decimation: Decimation) -> Array:

@@ -34,10 +34,7 @@ MOST = 50.0
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """Rivals at one joint with the information of all recordings so far on their parameters.
-
-    ``columns``: those of each rival in the regressor of all; ``information`` (c, c): of the recordings.
-    """
+    """Rivals at one joint; ``columns`` of each in the regressor of all; ``information`` (c, c) of the recordings."""
 
     state: ModelState
     rivals: tuple[Rival, ...]

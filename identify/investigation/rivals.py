@@ -28,10 +28,7 @@ STEP = 1.1
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """One explanation of a joint: an effect with its estimated parameters, or nothing.
-
-    ``values`` (k,): linear parameters of the ``term``, SI; both are ``None`` for nothing.
-    """
+    """One explanation of a joint: a ``term`` with its linear ``values`` (k,), SI; both are ``None`` for nothing."""
 
     name: str
     probability: float
@@ -39,10 +36,7 @@ class Rival:
     values: Array | None = None
 
     def columns(self, motion: Motion) -> Array:
-        """Return the torques of all joints per unit of each free parameter, (N, n, k + s).
-
-        The first k are the linear parameters, the others first-order changes by each continuous nonlinear one.
-        """
+        """Return the torques (N, n, k + s) per linear parameter, then per change of each nonlinear one."""
         term = self.term
         assert term is not None
         assert self.values is not None

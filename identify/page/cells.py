@@ -231,10 +231,7 @@ def _document(path: Path, _stamp: str, kind: str) -> Document | str:
 
 
 def read_drift(cell: Cell) -> Drift | None:
-    """Return the change against the first run in the history; ``None`` without a history or runs.
-
-    Raises ConfigError if the history cannot be read, DataError if its runs are of different models.
-    """
+    """Return the change against the first run in the history; ``None`` without a history or runs."""
     url, files = cell.database, list[Path]()
     if url is None:
         files = [folder / HISTORY_FILE for folder in cell.folders if (folder / HISTORY_FILE).is_file()]

@@ -36,11 +36,7 @@ class Message:
 
 @dataclass
 class Live:
-    """Last messages of one cell; each is replaced as a whole.
-
-    ``began``: begin of the listening; ``moved``: last advance of SYNC; ``ended``: regular end of a capture, s of the
-    monotonic clock; ``alive``: components with a liveliness token.
-    """
+    """Last messages of one cell, each replaced as a whole; times in s of the monotonic clock."""
 
     began: float
     health: Message | None = None

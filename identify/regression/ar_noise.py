@@ -37,10 +37,7 @@ class ArModel:
         return response
 
     def whiten(self, x: Array) -> Array:
-        """``C(z^-1) x / lambda`` along the first axis, (M, ...) to (M - order, ...), without an initial state.
-
-        Shape (0, ...) where there are no more samples than coefficients.
-        """
+        """``C(z^-1) x / lambda`` along the first axis, (M, ...) to (M - order or 0, ...), without an initial state."""
         rows = x.shape[0] - self.order
         if rows < 1:
             return np.empty((0, *x.shape[1:]))

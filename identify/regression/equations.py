@@ -73,10 +73,8 @@ class Estimate:
         return np.sqrt(np.diag(self.covariance))
 
 
-def filtered_regressor(
-    model: ArmModel, signals: Derivatives, decimation: Decimation, *, sharp_sign: bool = False
-) -> Array:
-    """Base regressor (M, n, b) of signals (N, n) after the parallel filter; ``sharp_sign``: unsmoothed friction sign.
+def filtered_regressor(model: ArmModel, signals: Derivatives, decimation: Decimation) -> Array:
+    """Base regressor (M, n, b) of signals (N, n) after the parallel filter.
 
     Piece by piece on all processors: unfiltered rows stay in the cache. Terms depend on the past: they get all at once.
     """
@@ -86,17 +84,16 @@ def filtered_regressor(
         decimation(signals.q)
 
     if decimation.passes_all and not model.terms:
-        return model.rigid_regressor(signals.q, signals.qd, signals.qdd, sharp_sign=sharp_sign)
+        return model.rigid_regressor(signals.q, signals.qd, signals.qdd)
 
     rigid = model.base.b - model.e
     filtered = np.empty((count, model.n, model.base.b))
     if model.terms:
         if signals.dt is None:
             raise ValueError("the terms of a model need the sampling period of the signals")
-        motion = model.motion(signals.q, signals.qd, signals.qdd, signals.dt, signals.start, sharp_sign=sharp_sign)
+        motion = model.motion(signals.q, signals.qd, signals.qdd, signals.dt, signals.start)
         filtered[:, :, rigid:] = decimation(model.term_regressor(motion))
 
-    smoothing = np.zeros(model.n) if sharp_sign else model.smoothing
     q, qd, qdd = (np.ascontiguousarray(x, dtype=np.float64) for x in (signals.q, signals.qd, signals.qdd))
 
     def fill(first: int) -> None:
@@ -104,7 +101,7 @@ def filtered_regressor(
         end = (last - 1) * decimation.factor + decimation.taps.size
         if decimation.taps.size == 1:
             kept = slice(first * decimation.factor, end, decimation.factor)
-            phi = model.rigid_regressor(signals.q[kept], signals.qd[kept], signals.qdd[kept], sharp_sign=sharp_sign)
+            phi = model.rigid_regressor(signals.q[kept], signals.qd[kept], signals.qdd[kept])
             filtered[first:last, :, :rigid] = decimation.taps[0] * phi
             return
         total, piece = np.zeros((last - first, model.n * rigid)), np.zeros((PIECE, model.n, rigid))
@@ -112,7 +109,7 @@ def filtered_regressor(
             stop = min(begin + PIECE, end)
             # The kernel writes the same elements every time: all others stay zero.
             span, phi = slice(begin, stop), piece[: stop - begin]
-            fill_regressor(model.chain, model.base_columns, smoothing, q[span], qd[span], qdd[span], phi)
+            fill_regressor(model.chain, model.base_columns, model.smoothing, q[span], qd[span], qdd[span], phi)
             touched = decimation.rows_of(begin, stop)
             touched = slice(max(touched.start, first), min(touched.stop, last))
             weights = decimation.weights(touched, begin, stop)

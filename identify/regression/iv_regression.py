@@ -117,10 +117,7 @@ class IvRegression:
         return rest
 
     def orthogonal_products(self, columns: Sequence[tuple[int, Array]], count: int) -> tuple[Array, Array]:
-        """``B'B`` (G, k, k) and ``B' residual`` (G, k) of ``B = orthogonalized(D)``, without computing B.
-
-        ``columns``: instruments (R_j, G k) of each joint on which they act, with its number, group after group.
-        """
+        """``B'B`` (G, k, k) and ``B' residual`` (G, k) of ``B = orthogonalized(D)``, columns (R_j, G k), without B."""
         width = columns[0][1].shape[1]
         gram, score = np.zeros((count, width // count, width // count)), np.zeros(width)
         for joint, own in columns:

@@ -15,26 +15,16 @@ _ROWS = 64
 """Rows eliminated at a time: with a hundred columns they fit the second-level cache."""
 
 
-def triangularize(*blocks: Array, columns: int, scales: Sequence[Array] = ()) -> Array:
-    """Reflect ``[A1 A2 ...]`` until its first ``columns`` are upper triangular (Householder); first b rows of ``Q' A``.
-
-    ``blocks``: (m, p_i) or (m,), side by side; ``scales``: divisors (p_i,) of their first columns.
-    """
-    matrices = [block.reshape(block.shape[0], -1) for block in blocks]
-    ends = np.cumsum([0, *(matrix.shape[1] for matrix in matrices)])
-    work = np.empty((matrices[0].shape[0], ends[-1]))
-    for k, matrix in enumerate(matrices):
-        np.divide(matrix, scales[k] if k < len(scales) else 1.0, out=work[:, ends[k] : ends[k + 1]])
+def triangularize(*blocks: Array, columns: int) -> Array:
+    """Reflect ``[A1 A2 ...]`` (Householder) until its first ``columns`` are upper triangular: rows of ``Q' A``."""
+    work = np.ascontiguousarray(np.column_stack(blocks))
     top = np.zeros((columns, work.shape[1]))
     _reflect(work, top)
     return top
 
 
 def triangularize_parts(parts: Iterable[Sequence[Array]], columns: int) -> tuple[Array, Array]:
-    """`triangularize` of rows that come in parts (equal column counts), of which one is in memory.
-
-    Returns factor and projections (b, p), and the norm (p,) of every column, 1 where it is zero.
-    """
+    """`triangularize` of rows that come in parts; also the norm (p,) of every column, 1 where it is zero."""
     top, squares = np.empty((0, 0)), np.zeros(0)
     for part in parts:
         work = np.column_stack(part)

@@ -14,10 +14,7 @@ from armident.identify.regression.ar_noise import ArModel
 def whitened(
     values: Sequence[Array], noise: Sequence[ArModel], keep: Sequence[NDArray[np.bool_]] | None = None
 ) -> Array:
-    """Values of all joints, as in 2.21, each whitened by its noise model, shape (R,) or (R, k).
-
-    ``values``: (M, n) or (M, n, k) per experiment; ``keep`` (M, n): equations to use.
-    """
+    """Values (M, n) or (M, n, k) of all joints (2.21) by experiment, whitened by their noise models, (R,) or (R, k)."""
     return np.concatenate([part for joint in whitened_series(values, noise, keep) for part in joint])
 
 

@@ -197,11 +197,6 @@ def document_entries(kind: type[Document]) -> list[GlossaryEntry]:
     return list(found.values())
 
 
-def method_entries() -> list[GlossaryEntry]:
-    """Return the methods of identification."""
-    return [GlossaryEntry(method.upper(), estimator(method).meaning) for method in METHODS]
-
-
 def verdict_entries() -> list[GlossaryEntry]:
     """Return the verdicts of a diagnosis."""
     return [GlossaryEntry(name.replace("_", " "), f"Verdict of a diagnosis: {text}") for name, text in VERDICTS.items()]
@@ -216,7 +211,8 @@ def variable_entries() -> list[GlossaryEntry]:
 def all_terms() -> tuple[GlossaryEntry, ...]:
     """Return all terms of reports: methods and tests, keys of documents, verdicts."""
     keys = (document_entries(kind) for kind in (IdentificationDocument, DiagnosisDocument))
-    every = (entry for part in (TERMS, method_entries(), verdict_entries(), *keys) for entry in part)
+    methods = [GlossaryEntry(method.upper(), estimator(method).meaning) for method in METHODS]
+    every = (entry for part in (TERMS, methods, verdict_entries(), *keys) for entry in part)
     return tuple({entry.name: entry for entry in every}.values())
 
 

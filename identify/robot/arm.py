@@ -206,10 +206,7 @@ class ArmModel:
         return out
 
     def forward_dynamics(self, theta: ArrayLike, q: ArrayLike, qd: ArrayLike, tau: ArrayLike) -> Floats:
-        """Joint accelerations (N, n) of the direct dynamic model with smoothed friction (2.9), without the terms.
-
-        Raises ArmidentError, with the sample, if a mass matrix is not positive definite.
-        """
+        """Joint accelerations (N, n) (2.9), without the terms; ArmidentError if a mass matrix is not definite."""
         q, qd, tau = self._motion(q, qd, tau)
         out = np.empty_like(q)
         failed = fill_forward_dynamics(self.chain, self.values(theta), self.smoothing, q, qd, tau, out)

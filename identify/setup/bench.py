@@ -91,10 +91,7 @@ class Bench:
 
     @cached_property
     def instants_used(self) -> tuple[NDArray[np.int64], ...]:
-        """Instants of the equations in each segment, at most `rows_kept` of all, the same for all hypotheses.
-
-        All instants count where the joints seldom move at once.
-        """
+        """Instants of the equations in each segment, at most `rows_kept`; all where the joints seldom move at once."""
         moves = [
             np.all(np.abs(self.decimation(s.qd))[:, self.moving] > AT_REST * self._fastest[self.moving], axis=1)
             for s in self.segments
@@ -252,11 +249,7 @@ def make_bench(
     working_rate: float = WORKING_RATE,
     known: Bench | None = None,
 ) -> Bench:
-    """Filter and differentiate recordings (SI, joint side, one rate); DataError if they are too short.
-
-    ``working_rate``: rate of the derivatives over the cut-off of the equations. ``known``: another bench of this
-    arm and motion, if there is one.
-    """
+    """Filter and differentiate recordings of one rate (SI, joint side); ``known``: another bench of arm and motion."""
     dt = experiments[0].dt
     bandwidth = motion_bandwidth([e.q for e in experiments], dt) if known is None else known.bandwidth
     cutoff = min(CUTOFF * bandwidth, 0.45 / dt)

@@ -53,10 +53,7 @@ TRIED = {
 
 
 def check_setup(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
-    """Compare the set-up as configured with its possible mistakes, each with everything refitted.
-
-    Recordings: SI, joint side, one rate. Mistakes that ``effects`` of the configuration correct are corrected first.
-    """
+    """Compare the set-up as configured (SI, joint side, one rate) with its possible mistakes, each refitted."""
     _validate(experiments, robot)
     # The matrices are small: threads delay each other.
     with threadpool_limits(1):

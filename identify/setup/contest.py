@@ -171,10 +171,7 @@ def _other_signs(search: Search, found: Step) -> Iterator[Step]:
 
 
 def same_correction(kind: str, joints: Sequence[int], a: Hypothesis, b: Hypothesis, *, each_own: bool = False) -> bool:
-    """True if two hypotheses contain the same correction of a kind at some joints.
-
-    ``each_own``: of torques only the proportions between the joints count.
-    """
+    """True if two hypotheses correct a kind alike at some joints; ``each_own``: of torques only proportions count."""
     if kind.startswith("gravity"):
         if not (a.gravity.any() and b.gravity.any()):
             return not a.gravity.any() and not b.gravity.any()
@@ -203,8 +200,3 @@ def _same_signals(kind: str, a: Array, b: Array, proportion: bool) -> bool:
     if proportion:
         off = off - np.median(off)
     return bool(np.abs(off).max() <= (SAME_PROPORTION if proportion else SAME_FACTOR))
-
-
-def words_of(steps: Sequence[Step]) -> list[str]:
-    """The last mistakes of steps in words, each once."""
-    return list(dict.fromkeys(step.mistakes[-1].words for step in steps))

@@ -14,7 +14,7 @@ from armident.configs.schema.robot import Effect
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, misfit
 from armident.identify.setup.moves import scaled
-from armident.identify.setup.plausible import LEAST_ODDS, plausible_factor, position_ratio, torque_ratio, velocity_ratio
+from armident.identify.setup.plausible import LEAST_ODDS, plausible_factor, ratios
 from armident.identify.setup.prior import WIRING, Mistake
 from armident.identify.setup.result import SetupFinding
 from armident.identify.setup.scales import LEAST_TORQUE
@@ -244,11 +244,9 @@ def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupF
         message += f", nor that of {', '.join(others)}" if others else ""
         remedy = "joints: drive: gain or rated of each drive by its data sheet"
     elif len(joints) > 1:
-        h = as_configured(robot)
-        message += (
-            f": the largest positions are on average {position_ratio(bench, h):.3g} of their limits, "
-            f"the largest torques {torque_ratio(bench, h):.3g}"
-        )
+        position, _, load = ratios(bench, as_configured(robot))
+        message += f": the largest positions are on average {position:.3g} of their limits, "
+        message += f"the largest torques {load:.3g}"
         if family == "side":
             remedy = f"armident import FILE --motor-side where positions and torques are the motors'; or {remedy}"
     return SetupFinding(KINDS.get(family, family), names, 1.0, message, remedy, True), entries
@@ -323,7 +321,7 @@ def _clock(step: Step, robot: RobotConfig, bench: Bench) -> SetupFinding:
     rate = 1.0 / (bench.period * step.h.clock)
     message = (
         f"the time column is in {unit}, not in s: at {1 / bench.period:.4g} Hz the largest velocities are on average "
-        f"{100 * velocity_ratio(bench, as_configured(robot)):.2g} % of their limits"
+        f"{100 * ratios(bench, as_configured(robot))[1]:.2g} % of their limits"
     )
     return SetupFinding("time_unit", names, 1.0, message, f"armident import FILE --rate {rate:.6g}", True)
 

@@ -96,10 +96,7 @@ def misfit(bench: Bench, h: Hypothesis, used: NDArray[np.bool_] | None = None, *
 
 @dataclass(frozen=True, eq=False)
 class _Given:
-    """Normal equations of recorded torques that belong to one joint each, in the joints' order and units.
-
-    ``owner``: joint of each recorded torque; ``recorded``: recorded torque of each joint, with its ``scale``, (n,).
-    """
+    """Normal equations of recorded torques that belong to one joint each, in the joints' order and units."""
 
     normal: Normal
     products: Array

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.identify.setup.calibration import CORRECTED, NAMED, probability
-from armident.identify.setup.contest import LEAST_ERROR, Contest, words_of
+from armident.identify.setup.contest import LEAST_ERROR, Contest
 from armident.identify.setup.describe import Described, corrected_robot, described, merged_scales
 from armident.identify.setup.plausible import LEAST_ODDS
 from armident.identify.setup.result import WIRED, SetupFinding
@@ -97,7 +97,8 @@ def judged_part(part: Described, contest: Contest, robot: RobotConfig) -> Descri
     correction = share > CORRECTED and explains(finding.kind, contest, joints)
     message = finding.message
     if equal:
-        message += f" (equally well explained by: {'; '.join(words_of(equal))})"
+        words = dict.fromkeys(step.mistakes[-1].words for step in equal)
+        message += f" (equally well explained by: {'; '.join(words)})"
     # Signals far beyond the limits are unusable, whatever unit is right.
     decisive = correction or (share >= NAMED and contest.more_plausible >= LEAST_ODDS)
     judged = replace(finding, message=message, probability=share, correction=correction, decisive=decisive)

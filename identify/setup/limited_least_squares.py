@@ -54,10 +54,7 @@ class Normal:
         return self.shared.size + int((self.own >= 0).sum())
 
     def solve(self, products: Array, power: Array, passes: int = PASSES) -> "Solution":
-        """Weight every torque by its own residual power. ``products`` (n, c): ``X' y``; ``power`` (n,): ``y' y``.
-
-        Raises numpy.linalg.LinAlgError if the equations are not positive definite.
-        """
+        """Weight every torque by its own residual power. ``products`` (n, c): ``X' y``; ``power`` (n,): ``y' y``."""
         given = np.ascontiguousarray(products), np.ascontiguousarray(power)
         theta, shares, explained, solvable = _solve(*self.parts, self.own, self.shared, self.used, *given, passes)
         if not solvable:

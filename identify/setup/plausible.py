@@ -34,24 +34,14 @@ NO_LIMIT = 1e6
 """Limits from this value on are placeholders of a file format."""
 
 
-def position_ratio(bench: Bench, h: Hypothesis) -> float:
-    """Geometric mean over the moving joints of the largest position over its limit; 1 if no limit is usable."""
-    return float(np.exp(_means(bench, h)[0]))
-
-
-def velocity_ratio(bench: Bench, h: Hypothesis) -> float:
-    """The same of the velocities."""
-    return float(np.exp(_means(bench, h)[1]))
-
-
-def torque_ratio(bench: Bench, h: Hypothesis) -> float:
-    """The same of the torques."""
-    return float(np.exp(_means(bench, h)[2]))
+def ratios(bench: Bench, h: Hypothesis) -> Array:
+    """Geometric means over moving joints of the largest position, velocity and torque over their limits; 1 without."""
+    return np.exp(_means(bench, h))
 
 
 def plausible_factor(bench: Bench, h: Hypothesis) -> float:
     """Common factor that brings the torques to the middle of their plausible range, 1 unless they are far from it."""
-    ratio = torque_ratio(bench, h)
+    ratio = float(ratios(bench, h)[2])
     return 1.0 if _beyond(np.log(ratio), *TORQUE) >= -LEAST_ODDS else float(np.sqrt(TORQUE[0] * TORQUE[1])) / ratio
 
 

@@ -144,7 +144,7 @@ def held_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list
         periods: dict[int, list[str]] = {}
         for j, joint in enumerate(robot.joints):
             if found := held(values[:, j]):
-                periods.setdefault(found.rows, []).append(joint.name)
+                periods.setdefault(found, []).append(joint.name)
         for rows, names in periods.items():
             rate = 1.0 / longest.dt
             message = (

@@ -98,10 +98,7 @@ def long_torque_shift(
 
 
 def common_shift(experiments: Sequence[Experiment], bench: Bench, h: Hypothesis) -> TorqueShift:
-    """Estimate the common shift of the torques, up to `RANGE` samples, and that of every joint.
-
-    Raises DataError or numpy.linalg.LinAlgError if the motion determines no shift.
-    """
+    """Estimate the common shift of the torques, and each joint's, up to `RANGE` samples; DataError or LinAlgError."""
     return _common(_estimated(experiments, bench, h, 0.0), RANGE)
 
 

@@ -29,10 +29,7 @@ SMALLEST_ARM = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """Frames of the n links, and triangles (K, 3, 3) in the frame of each.
-
-    ``links``: base link and moved links (n + 1). ``length``: of the arm from joint to joint, m.
-    """
+    """Frames of the n links, and triangles (K, 3, 3) of the n + 1 ``links`` in them; ``length``: joint to joint, m."""
 
     frames: LinkFrames
     revolute: tuple[bool, ...]

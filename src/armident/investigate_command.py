@@ -45,7 +45,7 @@ def investigate(
     yes: Annotated[bool, typer.Option("--yes", help="Move without asking.")] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the results. [default: investigation]")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print only the result document on stdout.")] = False,
-) -> None:
+) -> int:
     """Ask an arm to move until its recordings decide what its model lacks.
 
     Each round diagnoses all recordings and asks for the motion that tells the explanations apart most per second. It
@@ -118,9 +118,7 @@ def investigate(
     else:
         _print(found, folder, OUTCOMES[found.document.outcome])
         print(f"result: {written}\nreport: {html}\nmodel:  {model}")
-    code = {"healthy": 0, "set_up": DataError.exit_code}.get(found.outcome, FOUND)
-    if code:
-        raise typer.Exit(code)
+    return {"healthy": 0, "set_up": DataError.exit_code}.get(found.outcome, FOUND)
 
 
 def _print(found: "Investigation", folder: Path, meaning: str) -> None:

@@ -16,6 +16,7 @@ from armident.configs.schema.session import Bus
 from armident.drivers.can.frames import BusDown, frames
 from armident.drivers.can.udp import open_bus, open_python_can
 from armident.drivers.canopen import objects as od
+from armident.drivers.canopen.cia402_enable import read_drive_state
 from armident.drivers.canopen.master import DriveEvent, DriveMaster
 from armident.drivers.canopen.objects import Control, DriveState
 
@@ -130,7 +131,7 @@ def test_drives_are_mapped_by_the_session_and_enabled(udp_bus: Bus) -> None:
             assert servo.get(od.SYNC_COUNTER_OVERFLOW) == 240
             assert servo.get(od.HEARTBEAT_PRODUCER) == session.heartbeat_ms
         master.start()
-        assert master.states() == [DriveState.ENABLED, DriveState.ENABLED]
+        assert [read_drive_state(sdo) for sdo in master.drives] == [DriveState.ENABLED, DriveState.ENABLED]
         assert master.positions() == [-1234, -2468]
         # enabled at the position where it stands
         assert servos[2].get(od.TARGET_POSITION) == -2468
@@ -200,7 +201,7 @@ def test_a_drive_in_fault_is_reset_and_enabled(udp_bus: Bus) -> None:
         servos[1].state = DriveState.FAULT
         master.configure()
         master.start()
-        assert master.states() == [DriveState.ENABLED]
+        assert [read_drive_state(sdo) for sdo in master.drives] == [DriveState.ENABLED]
 
 
 @pytest.mark.slow

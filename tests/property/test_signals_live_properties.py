@@ -13,26 +13,24 @@ orders = st.sampled_from([2, 3])
 ratios = st.floats(-9, 3).map(lambda exponent: 10.0**exponent)
 
 
-@given(seeds, orders, ratios, st.lists(st.integers(0, 200), max_size=5), st.booleans())
-def test_how_the_stream_is_cut_into_batches_does_not_matter(
-    seed: int, order: int, nvr: float, cuts: list[int], gaps: bool
-) -> None:
+@given(seeds, ratios, st.lists(st.integers(0, 200), max_size=5), st.booleans())
+def test_how_the_stream_is_cut_into_batches_does_not_matter(seed: int, nvr: float, cuts: list[int], gaps: bool) -> None:
     rng = np.random.default_rng(seed)
     y = np.cumsum(rng.standard_normal((200, 3)), axis=0)
     if gaps:
         y[rng.random(y.shape) < 0.2] = np.nan
-    whole = VelocityFilter(3, DT, nvr, order)
+    whole = VelocityFilter(3, DT, nvr)
     expected = whole.handle(y)
-    stream = VelocityFilter(3, DT, nvr, order)
+    stream = VelocityFilter(3, DT, nvr)
     parts = [stream.handle(part) for part in np.split(y, sorted(cuts))]
     np.testing.assert_array_equal(np.concatenate([p.qd for p in parts]), expected.qd)
-    np.testing.assert_array_equal(stream.result().q_std, whole.result().q_std)
+    np.testing.assert_array_equal(stream._p, whole._p)
 
 
-@given(orders, ratios, st.floats(-10, 10), st.floats(-5, 5))
-def test_uniform_motion_is_followed_without_lag(order: int, nvr: float, start: float, speed: float) -> None:
+@given(ratios, st.floats(-10, 10), st.floats(-5, 5))
+def test_uniform_motion_is_followed_without_lag(nvr: float, start: float, speed: float) -> None:
     t = np.arange(400) * DT
-    live = VelocityFilter(1, DT, nvr, order)
+    live = VelocityFilter(1, DT, nvr)
     found = live.handle((start + speed * t)[:, None])
     # The prior of the slope keeps 1e-10 of it at first; the rest is rounding of positions, divided by dt.
     scale = abs(start) + abs(speed)

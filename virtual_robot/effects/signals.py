@@ -166,10 +166,7 @@ def _rewired(own, origin, sign, low, high, out):  # type: ignore[no-untyped-def]
 
 
 class Signals:
-    """Hidden errors of positions and signals (target ``drive`` or ``report``), applied once per control period.
-
-    ``acts``: there are any; ``swapped``: something is recorded under another name or sign.
-    """
+    """Hidden errors of positions and signals in each control period; ``swapped``: another name or sign is recorded."""
 
     def __init__(self, hidden: Sequence[Hidden], robot: RobotConfig, period: float) -> None:
         mine = [h for h in hidden if h.target in ("drive", "report")]

@@ -1,7 +1,5 @@
 """Signals that change less often than they are recorded, and signals in coarse steps."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from armident.arrays import Array
@@ -18,20 +16,8 @@ ON_GRID = 1e-3
 """Largest distance of a value from a multiple of the smallest change, in such changes, of a signal in coarse steps."""
 
 
-@dataclass(frozen=True)
-class Held:
-    """A signal that changes every ``rows``-th row."""
-
-    rows: int
-
-    @property
-    def late(self) -> float:
-        """Mean age of its values, rows."""
-        return (self.rows - 1) / 2.0
-
-
-def held(x: Array) -> Held | None:
-    """Return the period of a held signal (N,); ``None`` if it changes in every row, or at irregular times."""
+def held(x: Array) -> int | None:
+    """Return the period of a held signal (N,), rows; ``None`` if it changes in every row, or at irregular times."""
     step = np.diff(x)
     at = np.flatnonzero(step)
     if at.size < LEAST_CHANGES or at.size > 0.6 * step.size:
@@ -40,12 +26,12 @@ def held(x: Array) -> Held | None:
     most = (1.0 - EARLY) * float(between.sum())
     whole = [k for k in range(2, LONGEST + 1) if most > 0 and between[k::k].sum() >= most]
     if whole:
-        return Held(max(whole))
+        return max(whole)
     # The clocks of two sources drift: single periods are a row shorter or longer. Coarse steps come at any time.
     period = int(np.argmax(between))
     sizes = np.abs(step[at])
     near = between[period - 1 : period + 2].sum() >= most > 0
-    return Held(period) if period >= 4 and near and np.median(sizes) >= LEAST_COUNTS * sizes.min() else None
+    return period if period >= 4 and near and np.median(sizes) >= LEAST_COUNTS * sizes.min() else None
 
 
 def resolution(x: Array) -> float:

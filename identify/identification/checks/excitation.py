@@ -66,10 +66,7 @@ def workspace_postures(robot: RobotConfig, recorded: Array, count: int = EXAMINE
 
 
 def joint_uncertainty(model: ArmModel, theta: Array, covariance: Array, q: Array) -> tuple[Array, Array]:
-    """Uncertainty of inertia and gravity torque (n,) of each joint at postures q (N, n), without terms.
-
-    Relative, of the diagonal of the mass matrix, median of the postures; and of the gravity torque, mean, N m or N.
-    """
+    """Relative uncertainty of inertia, and uncertainty of gravity torque, N m or N, (n,), at postures (N, n)."""
     rigid = model.base.b - model.e
     if not np.isfinite(covariance).all():
         return np.full(model.n, np.inf), np.full(model.n, np.inf)

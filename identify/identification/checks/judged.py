@@ -12,11 +12,7 @@ from armident.identify.identification.support import Support
 
 @dataclass(frozen=True)
 class Judged:
-    """Parts of an identification that its verdict depends on; errors are measured in the equations of ``ls``.
-
-    ``solution`` is ``None`` for IDIM-LS; ``sign_given``: the configuration has the smoothing of the sign; ``reasons``
-    are of the checks before.
-    """
+    """Parts of an identification that its verdict depends on; errors are measured in the equations of ``ls``."""
 
     prepared: Prepared
     options: Options

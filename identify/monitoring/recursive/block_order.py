@@ -9,10 +9,7 @@ LONGEST_HOLD_S = 1.0
 
 
 class BlockOrder:
-    """Hands over blocks in the order of sequence numbers, each once; a missing one is given up after `LONGEST_HOLD_S`.
-
-    ``lost`` counts the blocks that were given up, those before the first one of a capture included.
-    """
+    """Hands over blocks once, in order; a missing one is given up after `LONGEST_HOLD_S` and counted in ``lost``."""
 
     def __init__(self) -> None:
         self._capture = ""

@@ -24,7 +24,7 @@ def watch(
         float | None, typer.Option(min=0.0, help="Duration of a live watch, s. [default: until Ctrl-C]")
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON document per line, every second.")] = False,
-) -> None:
+) -> int:
     """Track the friction of every joint while the arm runs, and report a change within a minute.
 
     Shows excitation, friction and state by joint, live or in replay, and publishes them. Exit code 4 after an alarm.
@@ -40,8 +40,5 @@ def watch(
     if recordings:
         if duration is not None:
             raise ConfigError("--duration: a replay ends with its recordings")
-        code = watch_recordings(recordings, config, options)
-    else:
-        code = watch_cell(config, options)
-    if code:
-        raise typer.Exit(code)
+        return watch_recordings(recordings, config, options)
+    return watch_cell(config, options)

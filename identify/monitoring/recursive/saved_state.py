@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from armident.configs import ConfigError, DataError
 
 SCHEMA = "armident/recursive-state/1"
-"""Version of the saved state: any change of the arithmetic or of the arrays changes it."""
+"""Version of the saved state: any change of the arithmetic, and any new array, changes it."""
 
 
 @runtime_checkable

@@ -12,7 +12,7 @@ from armident.identify.monitoring.reidentify.reidentify_options import Reidentif
 def reidentify(
     options: ReidentifyOptions,
     json: Annotated[bool, typer.Option("--json", help="Print only the result document on stdout.")] = False,
-) -> None:
+) -> int:
     """Move an arm along its exciting trajectory, identify it, and test for a change since its baseline.
 
     Plays the set points of the session within the limits of the robot, with a guard that stops the drives. Records,
@@ -24,10 +24,7 @@ def reidentify(
     if options.recordings is None:
         from armident.identify.monitoring.reidentify.run import reidentify_command
 
-        code = reidentify_command(options, as_json=json)
-    else:
-        from armident.identify.monitoring.reidentify.fleet import fleet_command
+        return reidentify_command(options, as_json=json)
+    from armident.identify.monitoring.reidentify.fleet import fleet_command
 
-        code = fleet_command(options.recordings, options, as_json=json)
-    if code:
-        raise typer.Exit(code)
+    return fleet_command(options.recordings, options, as_json=json)

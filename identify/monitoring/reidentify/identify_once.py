@@ -31,11 +31,10 @@ POLL_S = 0.5
 
 @dataclass(frozen=True)
 class OnceIdentified:
-    """Identification of a recording, its file, and whether this process made it."""
+    """Identification of a recording, and its file."""
 
     document: IdentificationDocument
     path: Path
-    ours: bool
 
 
 class _NotPublished(Exception):
@@ -137,7 +136,7 @@ def _claimed(ledger: Ledger, recorded: _Recorded, say: Say) -> OnceIdentified:
             if done is None:
                 continue
         elif entry.state == "done" and entry.result is not None:
-            done = OnceIdentified(load_document(entry.result, IdentificationDocument), entry.result, ours=False)
+            done = OnceIdentified(load_document(entry.result, IdentificationDocument), entry.result)
         elif entry.state == "failed":
             message = entry.message or "the recording cannot be identified"
             _announce_failure(ledger, recorded, message)
@@ -179,7 +178,7 @@ def _identified(
 ) -> OnceIdentified:
     found = result_of(recording.sha256, folder)
     if found is not None:
-        return OnceIdentified(found[1], found[0], ours=True)
+        return OnceIdentified(found[1], found[0])
     outcome = identify_recording(recording, robot, options)
     try:
         path, _ = write_identification(outcome, folder, identity)
@@ -188,7 +187,7 @@ def _identified(
             f"{error.filename or folder}: the result cannot be written: {error.strerror}; fix this; "
             f"a worker of the cell then identifies the recording, or run armident identify {recording.path}"
         ) from error
-    return OnceIdentified(outcome.document, path, ours=True)
+    return OnceIdentified(outcome.document, path)
 
 
 @contextmanager

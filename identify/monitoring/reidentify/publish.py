@@ -2,8 +2,9 @@
 
 import logging
 import time
+from contextlib import AbstractContextManager
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import zenoh
 
@@ -20,7 +21,7 @@ LINGER_S = 1.0
 """Time for which queries for a result are answered after it was published, s."""
 
 
-class StatusPublisher:
+class StatusPublisher(AbstractContextManager["StatusPublisher", None]):
     """Publishes status and results of one job, on the port of the worker if no worker runs, else on a free port."""
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
@@ -74,10 +75,6 @@ class StatusPublisher:
             log.warning("zenoh: the session failed; %s was not published", key)
             return False
         return True
-
-    def __enter__(self) -> Self:
-        """Return the publisher."""
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -70,10 +70,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a job; ``drift`` is ``None`` for a first run, and for a changed arm whose run is not usable.
-
-    ``investigation``: document of the investigation, whose outcome is ``answer``.
-    """
+    """Result of a job; ``drift``: ``None`` for a first or unusable run; ``answer``: that of the investigation."""
 
     document: IdentificationDocument
     path: Path

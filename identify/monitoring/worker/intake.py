@@ -34,10 +34,7 @@ STILL_S = 60.0
 
 
 class Intake:
-    """Enters recordings that have ended in the ledger, and reads them under a claim.
-
-    ``since``: files changed before it are passed over, s since 1970. ``refused`` takes streams that cannot be used.
-    """
+    """Enters ended recordings in the ledger, unless from before ``since``, s since 1970; reads them under a claim."""
 
     def __init__(
         self,

@@ -150,10 +150,7 @@ class LedgerSummary:
 
 @dataclass(frozen=True)
 class LedgerView:
-    """Ledger as a reader sees it, with the last recordings.
-
-    ``last``: entries with the time of their result, or of their files without one, s since 1970.
-    """
+    """Ledger as a reader sees it; ``last``: entries with the time of their result, or else of their files, s."""
 
     summary: LedgerSummary
     last: tuple[tuple[LedgerEntry, float], ...]
@@ -221,10 +218,7 @@ class Ledger:
         return bool(fresh)
 
     def enter(self, found: Sequence[FoundFiles], passed: str | None = None) -> None:
-        """Enter files to be read; files of these names and stamps are known, others of these names are superseded.
-
-        ``passed``: why they are passed over instead.
-        """
+        """Enter unknown files to be read in place of others of these names; ``passed``: why they are passed over."""
         state = {"state": "passed" if passed else "waiting", "message": passed, "announced": bool(passed)}
         with self._transaction() as db:
             for each in found:
@@ -330,10 +324,7 @@ class Ledger:
             db.execute("UPDATE experiments SET owner = NULL WHERE owner = :owner", self._me())
 
     def finish(self, sha256: str, state: State, result: Path | None, message: str, version: str | None = None) -> bool:
-        """Enter a result or failure; False if the claim was lost to another worker, whose result counts.
-
-        ``version``: of the program, if the failure may be its fault. ``passed`` needs no announcement.
-        """
+        """Enter a result or failure, with ``version`` if that may be at fault; False if the claim was lost."""
         values = {"sha256": sha256, "state": state, "result": None if result is None else str(result.absolute())}
         with self._transaction() as db:
             done = db.execute(
@@ -483,10 +474,7 @@ def open_ledger(path: Path, owner: str) -> Ledger:
 
 
 def view_of(path: Path, most: int) -> LedgerView:
-    """Return the state of a ledger with the last ``most`` recordings; nothing is written, and no worker waits.
-
-    Raises LedgerUnusable if it is damaged, or of another version.
-    """
+    """Return the state and the last ``most`` recordings of a ledger, without writing or waiting; LedgerUnusable."""
     when = "coalesce(finished, made)"
     try:
         with closing(_reading(path)) as db:

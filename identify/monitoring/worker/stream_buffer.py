@@ -57,10 +57,7 @@ class Assembly:
         return self.too_long or len(self.blocks) >= int(self.end["blocks"])
 
     def files(self, folders: Sequence[Path]) -> tuple[Path, ...]:
-        """Return the files of the capture if all of them can be reached, otherwise none.
-
-        No event may name a file outside of ``folders`` and their subfolders: DataError.
-        """
+        """Return the files of the capture if all are reachable, else none; DataError for one outside of ``folders``."""
         paths = [] if self.end is None else [str(path) for path in self.end["paths"]]
         found = tuple(Path(path) for path in paths)
         if not all(path.endswith(".mcap") for path in paths) or not all(map(is_file, found)):
@@ -91,10 +88,7 @@ class Assembly:
 
 
 class StreamBuffer:
-    """Collects events and blocks by the name of their capture, up to ``most_bytes``; then its file is read.
-
-    Messages that cannot be used are counted and reported.
-    """
+    """Collects events and blocks by capture, up to ``most_bytes``; reports messages that cannot be used."""
 
     def __init__(self, most_bytes: int | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         self._most_bytes, self._clock = MOST_BYTES if most_bytes is None else most_bytes, clock

@@ -45,6 +45,11 @@ def greet(name: Annotated[str, typer.Option(help="Whom to greet.")] = "arm") -> 
     print(f"hello {name}")
 
 
+def changed() -> int:
+    """Return an exit code."""
+    return 4
+
+
 def compile_while_interrupted() -> None:
     """Lose an interrupt in a callback, as a compiler does, and fail for that reason."""
     with suppress(KeyboardInterrupt):
@@ -55,7 +60,12 @@ def compile_while_interrupted() -> None:
 
 ENTRIES = [
     importlib.metadata.EntryPoint(name, f"{__name__}:{function}", GROUP)
-    for name, function in [("refuse", "refuse"), ("greet", "greet"), ("compile", "compile_while_interrupted")]
+    for name, function in [
+        ("refuse", "refuse"),
+        ("greet", "greet"),
+        ("changed", "changed"),
+        ("compile", "compile_while_interrupted"),
+    ]
 ]
 ABSENT = importlib.metadata.EntryPoint("absent", "daq.no_such_module:absent", GROUP)
 
@@ -114,6 +124,7 @@ def test_an_interrupt_exits_with_130_and_says_so() -> None:
 
 def test_a_command_chooses_its_own_exit_code() -> None:
     assert call("refuse", "changed")[0] == 4
+    assert call("changed")[0] == 4
 
 
 def test_options_reach_the_command() -> None:

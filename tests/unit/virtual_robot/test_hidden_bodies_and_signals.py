@@ -14,6 +14,7 @@ from armident.virtual_robot.effects import EFFECTS, hidden_effects
 from armident.virtual_robot.effects.signals import Signals
 from armident.virtual_robot.offline import simulate_recording
 from armident.virtual_robot.plant import Plant, pin
+from tests.plant_torques import acceleration, resistance
 from tests.statistics.twin_effects import SIZES
 from tests.unit.hidden import hide
 
@@ -24,9 +25,9 @@ Q = np.array([0.3, 0.4, 1.1, -0.5, 0.7, 0.2])
 def weight(plant: Plant, q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Static torques (n,) at ``q`` without friction, from the acceleration at rest."""
     still = np.zeros(q.size)
-    held = plant.resistance(q, still)
+    held = resistance(plant, q, still)
     plant.q[:] = q
-    out: NDArray[np.float64] = -plant.mass_matrix() @ plant.acceleration(q, still, held)
+    out: NDArray[np.float64] = -plant.mass_matrix() @ acceleration(plant, q, still, held)
     return out
 
 
@@ -96,7 +97,7 @@ def test_a_tilted_base_turns_gravity_and_keeps_its_size(tx40: RobotConfig, emps:
 def test_a_shaking_floor_pushes_with_mass_times_acceleration(emps: RobotConfig) -> None:
     plant, still = Plant(emps, [0.0], hide("base_vibration", "joint_1", amplitude=0.3, frequency=5.0)), np.zeros(1)
     for t in (0.0, 0.03, 0.05, 0.11):
-        a = plant.acceleration(still, still, plant.resistance(still, still), t)[0]
+        a = acceleration(plant, still, still, resistance(plant, still, still), t)[0]
         assert abs(a) == pytest.approx(0.3 * abs(math.sin(2 * math.pi * 5.0 * t)), abs=1e-12)
 
 

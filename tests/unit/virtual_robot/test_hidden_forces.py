@@ -11,6 +11,7 @@ from armident.configs import RobotConfig
 from armident.configs.schema.scenario import Scenario
 from armident.virtual_robot.inertias import rest_posture
 from armident.virtual_robot.plant import Plant
+from tests.plant_torques import acceleration, resistance
 from tests.unit.hidden import hide
 
 PERIOD = 200e-6
@@ -28,7 +29,7 @@ class Joint2:
     def all(self, q: float, qd: float, t: float = 0.0, beside: float = 0.0) -> NDArray[np.float64]:
         where, speed = np.zeros(6), np.zeros(6)
         where[1], speed[1], speed[2] = q, qd, beside
-        return self.plant.resistance(where, speed, t) - self.healthy.resistance(where, speed, t)
+        return resistance(self.plant, where, speed, t) - resistance(self.healthy, where, speed, t)
 
     def __call__(self, q: float, qd: float, t: float = 0.0, beside: float = 0.0) -> float:
         return float(self.all(q, qd, t, beside)[1])
@@ -110,7 +111,7 @@ def test_the_motor_of_a_prismatic_joint_cogs_once_per_pitch(emps: RobotConfig) -
     plant = Plant(emps, [0.0], hide("cogging_torque", "joint_1", amplitude=2.0, harmonic=3.0, pitch=0.01))
     healthy = Plant(emps, [0.0])
     for q in (0.0, 0.0008, 0.01 + 0.0008):
-        extra = plant.resistance(np.array([q]), np.zeros(1)) - healthy.resistance(np.array([q]), np.zeros(1))
+        extra = resistance(plant, np.array([q]), np.zeros(1)) - resistance(healthy, np.array([q]), np.zeros(1))
         assert extra[0] == pytest.approx(2.0 * math.sin(3 * 2 * math.pi * q / 0.01), abs=1e-12)
 
 
@@ -162,9 +163,8 @@ def test_a_joint_that_holds_a_weight_has_more_friction_than_one_that_does_not(tx
         for _ in range(250):
             plant.advance(np.zeros(6), PERIOD)
         fallen[name] = plant.qd[1]
-    weight = Plant(tx40, [0.0, 1.2, 0.5, 0.0, 0.0, 0.0]).acceleration(
-        np.array([0.0, 1.2, 0.5, 0.0, 0.0, 0.0]), np.zeros(6), np.zeros(6)
-    )[1]
+    posture = np.array([0.0, 1.2, 0.5, 0.0, 0.0, 0.0])
+    weight = acceleration(Plant(tx40, posture), posture, np.zeros(6), np.zeros(6))[1]
     assert np.sign(fallen["healthy"]) == np.sign(weight)
     assert 0.5 < fallen["loaded"] / fallen["healthy"] < 0.98
 

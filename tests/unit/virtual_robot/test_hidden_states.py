@@ -14,6 +14,7 @@ from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.scenario import HiddenEffect, Scenario
 from armident.virtual_robot.arm_parameters import arm_parameters
 from armident.virtual_robot.plant import Plant
+from tests.plant_torques import resistance
 
 PERIOD = 200e-6
 HOLD = 5
@@ -218,7 +219,7 @@ def test_steady_sliding_has_the_stribeck_curve(emps: RobotConfig) -> None:
     plant = Plant(emps, [0.0], hide(entry("stribeck_friction", extra=10.0, velocity=0.02)))
     for speed in (0.01, 0.05, 0.3):
         curve = FV * speed + OFF + FC + 10.0 * math.exp(-((speed / 0.02) ** 2))
-        assert plant.resistance(np.zeros(1), np.array([speed]))[0] == pytest.approx(curve)
+        assert resistance(plant, np.zeros(1), np.array([speed]))[0] == pytest.approx(curve)
     # An axis that slides at 0.05 m/s keeps its speed under that force.
     curve = FV * 0.05 + OFF + FC + 10.0 * math.exp(-6.25)
     plant.velocities[0] = 0.05

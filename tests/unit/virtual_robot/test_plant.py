@@ -11,6 +11,7 @@ from armident.configs.urdf_inertials import INERTIAL
 from armident.virtual_robot import inertias
 from armident.virtual_robot.model import build_model, pin
 from armident.virtual_robot.plant import Plant
+from tests.plant_torques import acceleration, resistance
 from tests.tools import tx40_inertias
 
 PERIOD = 200e-6
@@ -76,7 +77,7 @@ def reference(plant: Plant, q: NDArray[np.float64], torques: NDArray[np.float64]
     for k, tau in enumerate(torques):
 
         def rhs(_: float, y: NDArray[np.float64], tau: NDArray[np.float64] = tau) -> NDArray[np.float64]:
-            return np.concatenate([y[n:], plant.acceleration(y[:n], y[n:], tau)])
+            return np.concatenate([y[n:], acceleration(plant, y[:n], y[n:], tau)])
 
         state = solve_ivp(rhs, (0.0, PERIOD), state, rtol=1e-9, atol=1e-11).y[:, -1]
         out[k] = state[:n]
@@ -111,10 +112,10 @@ def test_holding_brakes_do_not_creep(tx40: RobotConfig) -> None:
 
 def test_friction_slows_by_the_coefficients_of_table_b4(tx40: RobotConfig) -> None:
     plant = Plant(tx40, np.zeros(6))
-    one = plant.resistance(np.zeros(6), np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    one = resistance(plant, np.zeros(6), np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
     # atan(150 * 2) is 0.2 % short of its limit.
     assert one[0] == pytest.approx(8.00 * 2.0 + 7.34, rel=2e-3)
-    wrist = plant.resistance(np.zeros(6), np.array([0.0, 0.0, 0.0, 0.0, 1.0, 2.0]))
+    wrist = resistance(plant, np.zeros(6), np.array([0.0, 0.0, 0.0, 0.0, 1.0, 2.0]))
     assert wrist[4] == pytest.approx(1.79 * 1.0 + 3.07 + 0.61 * 2.0 + 1.90, rel=5e-3)
     assert wrist[5] == pytest.approx(0.65 * 2.0 + 0.30 + 0.61 * 1.0 + 1.90, rel=5e-3)
 

@@ -30,6 +30,7 @@ from armident.virtual_robot.twin import (
     write_twin,
 )
 from tests.fixtures.other_arms import write_scara
+from tests.plant_torques import acceleration, resistance
 from tests.tools.tx40_inertias import pseudo_inertia
 
 
@@ -100,7 +101,7 @@ def test_the_masses_of_a_urdf_move_the_arm(tmp_path: Path) -> None:
     mass = plant.mass_matrix()
     # quill and flange move with the lift; upper arm, forearm and they weigh nothing at vertical axes
     assert mass[2, 2] - standard["ia3"] == pytest.approx(1.2 + 0.4)
-    hold = plant.acceleration(plant.q, np.zeros(4), np.array([0.0, 0.0, 9.81 * 1.6, 0.0]))
+    hold = acceleration(plant, plant.q, np.zeros(4), np.array([0.0, 0.0, 9.81 * 1.6, 0.0]))
     offset = np.linalg.solve(mass, [standard[f"off{j}"] for j in range(1, 5)])
     np.testing.assert_allclose(hold + offset, 0.0, atol=1e-9)
     drawn = load_twin(tmp_path / "scara.yaml", ParameterChoice(draw_masses=True))
@@ -188,8 +189,8 @@ def test_a_scenario_sets_controller_friction_and_noise(panda: RobotConfig) -> No
     chosen = with_scenario(parameters, robot, given)
     for joint in range(7):
         arm.enable(joint, True)
-    resistance = arm.plant.resistance(np.zeros(7), np.array([0.0, 2.0, 0, 0, 0, 0, 0]))
-    assert resistance[1] == pytest.approx(2.0 * 2.5 + 0.25 + parameters.standard["fc2"], rel=1e-2)
+    brake = resistance(arm.plant, np.zeros(7), np.array([0.0, 2.0, 0, 0, 0, 0, 0]))
+    assert brake[1] == pytest.approx(2.0 * 2.5 + 0.25 + parameters.standard["fc2"], rel=1e-2)
     assert chosen.noise.sampled[0] == pytest.approx(0.25)
     assert chosen.noise.decimated[2] == pytest.approx(0.16)
     assert chosen.bandwidth_hz == (12.0,) * 7

@@ -28,15 +28,14 @@ def measured(seed: int = 0) -> NDArray[np.float64]:
     return q + NOISE * np.random.default_rng(seed).standard_normal(q.shape)
 
 
-def oracle(y: NDArray[np.float64], order: int, nvr: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """States (N, order) in samples and the last covariance of filterpy's filter on one joint."""
-    kf: Any = KalmanFilter(dim_x=order, dim_z=1)
-    model = VelocityFilter(1, DT, nvr, order)
-    kf.F, kf.H, kf.R = model.F, model.H, model.R
-    kf.Q = Q_continuous_white_noise(order, dt=1.0, spectral_density=nvr)
-    kf.x = np.zeros((order, 1))
+def oracle(y: NDArray[np.float64], nvr: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """States (N, 3) in samples and the last covariance of filterpy's filter on one joint."""
+    kf: Any = KalmanFilter(dim_x=3, dim_z=1)
+    kf.F, kf.H, kf.R = np.array([[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]), np.eye(3)[:1], np.eye(1)
+    kf.Q = Q_continuous_white_noise(3, dt=1.0, spectral_density=nvr)
+    kf.x = np.zeros((3, 1))
     kf.x[0] = y[0]
-    kf.P = np.diag([1.0] + [PRIOR] * (order - 1))
+    kf.P = np.diag([1.0, PRIOR, PRIOR])
     states = [kf.x[:, 0].copy()]
     for value in y[1:]:
         kf.predict()
@@ -45,26 +44,19 @@ def oracle(y: NDArray[np.float64], order: int, nvr: float) -> tuple[NDArray[np.f
     return np.array(states), kf.P
 
 
-@pytest.mark.parametrize(("order", "nvr"), [(2, 1e-3), (2, 1.0), (3, 1e-7), (3, 1e-2)])
-def test_states_and_covariance_are_those_of_filterpy(order: int, nvr: float) -> None:
+@pytest.mark.parametrize("nvr", [1e-7, 1e-2])
+def test_states_and_covariance_are_those_of_filterpy(nvr: float) -> None:
     y = measured()[:1500]
     y[700:720, 0] = np.nan
-    ours = VelocityFilter(2, DT, nvr, order)
+    ours = VelocityFilter(2, DT, nvr)
     found = ours.handle(y)
     for j in range(2):
-        states, covariance = oracle(y[:, j], order, nvr)
+        states, covariance = oracle(y[:, j], nvr)
         # The diffuse prior makes the first few samples ill-conditioned in both.
         np.testing.assert_allclose(found.q[10:, j], states[10:, 0], atol=1e-9)
         np.testing.assert_allclose(found.qd[10:, j] * DT, states[10:, 1], atol=1e-9)
-        if order == 3:
-            np.testing.assert_allclose(found.qdd[10:, j] * DT**2, states[10:, 2], atol=1e-9)
+        np.testing.assert_allclose(found.qdd[10:, j] * DT**2, states[10:, 2], atol=1e-9)
         np.testing.assert_allclose(ours._p[j], covariance, rtol=1e-6)
-
-
-@pytest.mark.parametrize("order", [2, 3])
-def test_process_noise_is_filterpys(order: int) -> None:
-    theirs = Q_continuous_white_noise(order, dt=1.0, spectral_density=0.3)
-    np.testing.assert_allclose(VelocityFilter(1, DT, 0.3, order).Q[0], theirs)
 
 
 def test_samples_one_by_one_and_in_batches_give_the_same_bits() -> None:
@@ -75,7 +67,6 @@ def test_samples_one_by_one_and_in_batches_give_the_same_bits() -> None:
     last = stream.handle(y[499])
     qd = np.concatenate([*(p.qd for p in parts), last.qd])
     np.testing.assert_array_equal(qd, whole.qd)
-    np.testing.assert_array_equal(stream.result().qd, whole.qd[-1])
 
 
 def test_velocity_is_at_least_four_times_better_than_differences_and_acceleration_usable() -> None:
@@ -95,44 +86,11 @@ def test_velocity_is_at_least_four_times_better_than_differences_and_acceleratio
     assert (error(found.qd, qd) < 0.25 * error(np.diff(y, axis=0, prepend=y[:1]) / DT, qd)).all()
 
 
-def test_standard_deviations_are_those_of_the_errors_where_the_model_holds() -> None:
-    # 400 joints that follow the model: white jerk, white noise.
-    rng = np.random.default_rng(3)
-    joints, samples, nvr = 400, 300, 1e-4
-    truth = VelocityFilter(joints, DT, nvr)
-    root = np.linalg.cholesky(truth.Q[0])
-    state, y = np.zeros((joints, 3)), np.empty((samples, joints))
-    for k in range(samples):
-        state = state @ truth.F.T + NOISE * rng.standard_normal((joints, 3)) @ root.T
-        y[k] = state[:, 0] + NOISE * rng.standard_normal(joints)
-    truth.handle(y)
-    found = truth.result()
-    for i, (value, std) in enumerate(((found.q, found.q_std), (found.qd, found.qd_std), (found.qdd, found.qdd_std))):
-        z = (value - state[:, i] / DT**i) / std
-        # The variance of 400 is known to 7 %, three of that.
-        assert np.var(z) == pytest.approx(1.0, abs=0.22)
-
-
-def test_uncertainty_grows_through_a_gap_and_shrinks_after_it() -> None:
-    y = measured()[:2000]
-    live = VelocityFilter(2, DT, 1e-5)
-    live.handle(y[:1000])
-    before = live.result()
-    live.handle(np.full((50, 2), np.nan))
-    inside = live.result()
-    live.handle(y[1050:])
-    after = live.result()
-    assert (inside.qd_std > 3 * before.qd_std).all()
-    assert (after.qd_std < 0.5 * inside.qd_std).all()
-    np.testing.assert_array_equal(after.measured, [1950, 1950])
-
-
 def test_a_reset_filter_is_a_new_one() -> None:
     y = measured()[:300]
     used = VelocityFilter(2, DT, 1e-5)
     used.handle(y[::-1])
     used.reset()
-    assert np.isnan(used.result().qd).all()
     np.testing.assert_array_equal(used.handle(y).qd, VelocityFilter(2, DT, 1e-5).handle(y).qd)
 
 
@@ -148,7 +106,6 @@ def test_a_joint_that_is_not_measured_yet_does_not_hold_up_the_others() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: VelocityFilter(2, DT, 1e-5, order=4), "expected 2 or 3"),
         (lambda: VelocityFilter(2, 0.0, 1e-5), "sampling period"),
         (lambda: VelocityFilter(2, DT, [1e-5, -1.0]), "one positive number or 2"),
         (lambda: VelocityFilter(2, DT, 1e-5).handle(np.zeros((3, 5))), "for a velocity filter of 2 joints"),
