@@ -53,7 +53,7 @@ class Noise:
         averaged: int = 1,
     ) -> None:
         n = robot.n
-        white, slow = amplitudes(robot, period, size)
+        white, slow = amplitudes(robot, period, size, averaged)
         gain = np.array([joint.drive.gain for joint in robot.joints])
         self._current = level * white / np.abs(gain)
         self._disturbance = level * slow
