@@ -82,7 +82,8 @@ def write_supplement(model: ExportedModel, file: Path, sheet: LimitationSheet, p
     """
     code, rigid = code_of(model, "python"), sheet.holds.issuperset(EVERY_PART)
     effects = [effect for effect in code.content["effects"] if effect["number"] not in sheet.effects]
-    if rigid and not effects:
+    gears = {number: gear for number, gear in code.content["gears"].items() if number not in sheet.effects}
+    if rigid and not effects and not gears:
         return None
     frames, name = with_rigid_effects(model)[0].frames, _safe(file.name)
     rotors = [joint.rotor_inertia if "rotor inertia" in sheet.holds else 0.0 for joint in model.joints]
@@ -94,9 +95,8 @@ def write_supplement(model: ExportedModel, file: Path, sheet: LimitationSheet, p
     }
     title = f"Joint torques of the robot {model.robot.name} that {name} lacks."
     head = {"title": title, "lines": code.content["head"]["lines"]}
-    write_atomically(
-        path, code.render("model.py.jinja", feed_forward=False, supplement=supplement, effects=effects, head=head)
-    )
+    lacking = {"supplement": supplement, "effects": effects, "gears": gears, "head": head}
+    write_atomically(path, code.render("model.py.jinja", feed_forward=False, **lacking))
     # Omissions with a reason are corrections of recordings, which are no torques of the arm.
     lost = [each.part for each in sheet.omitted if each in code.sheet.omitted and not each.reason]
     instead = "" if rigid else ", with dry friction instead of that of the program"
@@ -141,6 +141,7 @@ def code_of(model: ExportedModel, format_name: str) -> Code:
         "couplings": couplings,
         "effects": effects,
         "memory": instant.memory,
+        "gears": instant.gears,
         "functions": sorted(
             {"atan", "cos", "pi", "sin"} | {f for f in FUNCTIONS if any(f"{f}(" in t for t in formulas)}
         ),

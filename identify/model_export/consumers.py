@@ -66,16 +66,16 @@ class ProgramRun:
 
 def run_python(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
     """Call the Python module."""
-    return ProgramRun(f"Python {versions()['python']}", module_torque(model, files[0], motion, "inverse_dynamics"))
+    return ProgramRun(f"Python {versions()['python']}", module_torque(files[0], motion, "inverse_dynamics"))
 
 
-def module_torque(model: ExportedModel, file: Path, motion: GivenMotion, function: str = "supplement") -> Floats:
+def module_torque(file: Path, motion: GivenMotion, function: str = "supplement") -> Floats:
     """Return the torques (N, n) by a function of a Python module."""
     module, torque = _module(file), []
-    memory = [0.0] * len(code_of(model, "python").content["memory"])
+    memory = [0.0] * getattr(module, "MEMORY", 0)
     for row in motion.rows:
         q, qd, qdd = (x.tolist() for x in row)
-        memory = module.advance(memory, qd, motion.dt) if memory else memory
+        memory = module.advance(memory, q, qd, qdd, motion.dt) if memory else memory
         torque.append(getattr(module, function)(q, qd, qdd, *([memory] if memory else ())))
     return np.array(torque)
 
