@@ -16,7 +16,7 @@ from armident.configs import ConfigError
 from armident.identify.documents.base import versions
 from armident.identify.model_export.code_writer import code_of
 from armident.identify.model_export.exported_model import ExportedModel
-from armident.identify.model_export.fmu_writer import compiled
+from armident.identify.model_export.fmu_writer import GEAR_STEP_S, compiled
 from armident.identify.model_export.sdf_writer import joint_name
 from armident.identify.robot.chain import Floats
 
@@ -120,10 +120,11 @@ def _module(file: Path) -> ModuleType:
 
 
 def run_fmu(model: ExportedModel, files: Sequence[Path], motion: GivenMotion, torque: Floats) -> ProgramRun:
-    """Give the unit motion and ``torque`` (N, n): wrong accelerations times the mass matrix are its error."""
+    """Let the unit follow a motion: find the torques of its accelerations, near ``torque`` (N, n)."""
     fmpy, fmi2 = _package("fmpy"), _package("fmpy.fmi2", "fmpy")
-    n, mass, wrong = model.arm.n, model.arm.mass_matrix(model.theta, motion.q), np.zeros_like(torque)
-    remembers = bool(code_of(model, "fmu").content["memory"])
+    n, needed, content = model.arm.n, np.zeros_like(torque), code_of(model, "fmu").content
+    # Impacts in a gear are shorter than a sample: their mean torque counts.
+    parts = int(np.ceil(motion.dt / GEAR_STEP_S)) if content["gears"] else 1
     description = fmpy.read_model_description(str(files[0]))
     with tempfile.TemporaryDirectory() as folder:
         unit = fmi2.FMU2Slave(
@@ -138,14 +139,20 @@ def run_fmu(model: ExportedModel, files: Sequence[Path], motion: GivenMotion, to
         unit.exitInitializationMode()
         taus, states, accelerations = list(range(n)), list(range(n, 3 * n)), list(range(3 * n, 4 * n))
         for k, (q, qd, qdd) in enumerate(motion.rows):
-            unit.setReal(states, [*q, *qd])
-            unit.setReal(taus, torque[k].tolist())
-            wrong[k] = mass[k] @ (qdd - unit.getReal(accelerations))
-            if remembers:  # nothing else is carried from one instant to the next
-                unit.doStep(currentCommunicationPoint=k * motion.dt, communicationStepSize=motion.dt)
+            for s in motion.dt * ((np.arange(parts) + 0.5) / parts - 0.5):
+                unit.setReal(states, [*(q + s * qd), *(qd + s * qdd)])
+                found = []
+                for tau in (*(torque[k] + np.eye(n)), torque[k]):
+                    unit.setReal(taus, tau.tolist())
+                    found.append(np.array(unit.getReal(accelerations)))
+                tau = torque[k] + np.linalg.solve(np.array(found[:-1]).T - found[-1][:, None], qdd - found[-1])
+                needed[k] += tau / parts
+                if content["memory"] or content["gears"]:  # nothing else is carried from one instant to the next
+                    unit.setReal(taus, tau.tolist())
+                    unit.doStep(currentCommunicationPoint=k * motion.dt + s, communicationStepSize=motion.dt / parts)
         unit.terminate()
         unit.freeInstance()
-    return ProgramRun(f"FMPy {version('fmpy')}", torque + wrong)
+    return ProgramRun(f"FMPy {version('fmpy')}", needed)
 
 
 def run_mjcf(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:

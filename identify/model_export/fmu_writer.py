@@ -18,6 +18,10 @@ from armident.identify.model_export.sheet import LimitationSheet
 TOLERANCE = 1e-8
 """Relative and absolute tolerance of the integration, unless the experiment gives another one."""
 
+GEAR_STEP_S = 1e-4
+"""Period at which links in elastic gears or backlash are advanced, s: two masses on a prismatic axis move as exactly
+simulated to 0.2 % (resonance at 15 Hz) and 1 % (gap of 2 mm); at 1 ms, a motor of 5 % of the inertia is wrong by 12 %."""
+
 OPTIONS = ("-std=c99", "-O2", "-fPIC", "-shared")
 """Options of the compiler."""
 
@@ -48,6 +52,7 @@ def write_fmu(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationS
     interface = {
         "guid": f"{{{uuid.uuid5(uuid.NAMESPACE_URL, source)}}}",
         "tolerance": TOLERANCE,
+        "period": GEAR_STEP_S if code.content["gears"] else 1e-3,
         "start": start,
         "variables": variables,
         "outputs": [k for k, v in enumerate(variables, start=1) if v.causality == "output"],

@@ -43,7 +43,9 @@ EFFECTS: dict[str, tuple[dict[str, float], tuple[float, ...]]] = {
     "friction_drift": ({"time_constant": 1.5}, (2.0, 1.0)),
     "friction_drift/work": ({"decay": 0.7}, (2.0, 1.0)),
     "joint_elasticity": ({"frequency": RESONANCE_HZ, "damping": 0.1, "rotor": 0.0}, (math.nan,)),
+    "joint_elasticity with its motor": ({"frequency": RESONANCE_HZ, "damping": 0.1, "rotor": 0.25}, (math.nan,)),
     "backlash": ({"gap": 2e-4, "rotor": 0.0}, (1.0,)),
+    "backlash with its motor": ({"gap": 2e-4, "rotor": 0.25}, (1.0,)),
     "cogging_torque": ({"harmonic": 6.0}, (1.5, 1.5)),
     "joint_spring": ({}, (20.0,)),
 }
@@ -69,7 +71,7 @@ def model_with(name: str) -> ExportedModel:
                 :, 1, 1
             ].mean()
         )
-        values = (1.0 / (mean * (2.0 * np.pi * RESONANCE_HZ) ** 2),)
+        values = (1.0 / ((mean - shapes["rotor"]) * (2.0 * np.pi * RESONANCE_HZ) ** 2),)
     theta[len(arm.names) - arm.e :] = values
     return exported(robot, theta)
 
