@@ -30,10 +30,11 @@ LEAST_INERTIA = 0.04
 
 
 class Gear(NamedTuple):
-    """Motion ``x`` of a link relative to its motor: ``inertia x'' + damping x' + stiffness x = share (rotor qdd - load)``.
+    """Equation of the motion ``x`` of a link relative to its motor.
 
-    ``x`` stays within ``limit`` where there is no stiffness. ``inertia``: that of the link less ``rotor``, at least
-    ``least``; ``load``: torque of the links; N m or N, kg m^2 or kg, rad or m.
+    ``inertia x'' + damping x' + stiffness x = share (rotor qdd - load)``, within ``limit`` where there is no stiffness.
+    ``load``: torque of the links, N m or N; ``inertia``: that of the link less ``rotor``, at least ``least``, kg m^2 or
+    kg; ``x`` and ``limit``, rad or m.
     """
 
     joint: int
@@ -43,6 +44,14 @@ class Gear(NamedTuple):
     damping: float
     stiffness: float
     limit: float
+
+    @property
+    def of_bodies(self) -> "Gear":
+        """Equation of two bodies with the same compliance or gap: the whole load moves the link."""
+        share = self.share
+        return self._replace(
+            share=1.0, damping=self.damping / share, stiffness=self.stiffness / share, limit=self.limit / share
+        )
 
 
 class MotorOrder(Periodic):

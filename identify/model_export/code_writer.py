@@ -114,9 +114,12 @@ def code_of(model: ExportedModel, format_name: str) -> Code:
     """Return names, tables and formulas of a model. ``format_name``: format for the sheet."""
     instant = instant_model(model.arm, model.theta, model.recorded_s)
     remarks = _remarks(model, instant)
-    if not _motors_have_inertia(model.arm, instant):
+    possible = all(gear.share > 0.0 for gear in instant.gears.values())
+    if format_name == "fmu" and possible:
+        instant = replace(instant, gears={number: gear.of_bodies for number, gear in instant.gears.items()})
+    if not possible or not _motors_have_inertia(model.arm, instant):
         gears = ", ".join(model.effects[number].title for number in instant.gears)
-        remarks.append(f"{gears}: forward dynamics need an inertia of the motor (ia of the joint, or rotor of the effect)")
+        remarks.append(f"{gears}: forward dynamics need an inertia of the motor (ia of the joint, rotor of the effect)")
         if format_name == "fmu":
             instant = replace(instant, held=instant.held - set(instant.gears), gears={})
     values, chain = model.arm.values(instant.theta), model.arm.chain
@@ -197,7 +200,8 @@ def _safe(line: str) -> str:
 
 def _motors_have_inertia(arm: ArmModel, instant: InstantModel) -> bool:
     """Return True if links that move in their gears leave `LEAST_MOTOR` of the mass matrix to the motors."""
-    theta, postures = instant.theta, arm.motion(*np.zeros((3, 1, arm.n)), dt=1.0).postures
+    still = np.zeros((1, arm.n))
+    theta, postures = instant.theta, arm.motion(still, still, still, dt=1.0).postures
     mass, links = (arm.mass_matrix(each, postures) for each in (theta, np.where(arm.of_links, theta, 0.0)))
     left = mass.copy()
     for gear in instant.gears.values():

@@ -125,6 +125,7 @@ def run_fmu(model: ExportedModel, files: Sequence[Path], motion: GivenMotion, to
     n, needed, content = model.arm.n, np.zeros_like(torque), code_of(model, "fmu").content
     # Impacts in a gear are shorter than a sample: their mean torque counts.
     parts = int(np.ceil(motion.dt / GEAR_STEP_S)) if content["gears"] else 1
+    step = motion.dt / parts
     description = fmpy.read_model_description(str(files[0]))
     with tempfile.TemporaryDirectory() as folder:
         unit = fmi2.FMU2Slave(
@@ -138,18 +139,24 @@ def run_fmu(model: ExportedModel, files: Sequence[Path], motion: GivenMotion, to
         unit.enterInitializationMode()
         unit.exitInitializationMode()
         taus, states, accelerations = list(range(n)), list(range(n, 3 * n)), list(range(3 * n, 4 * n))
+
+        def answer(state: Floats, tau: Floats) -> Floats:
+            unit.setReal(states, state.tolist())
+            unit.setReal(taus, tau.tolist())
+            return np.array(unit.getReal(accelerations))
+
         for k, (q, qd, qdd) in enumerate(motion.rows):
-            for s in motion.dt * ((np.arange(parts) + 0.5) / parts - 0.5):
-                unit.setReal(states, [*(q + s * qd), *(qd + s * qdd)])
-                found = []
-                for tau in (*(torque[k] + np.eye(n)), torque[k]):
-                    unit.setReal(taus, tau.tolist())
-                    found.append(np.array(unit.getReal(accelerations)))
-                tau = torque[k] + np.linalg.solve(np.array(found[:-1]).T - found[-1][:, None], qdd - found[-1])
+            here, change = np.concatenate([q, qd]), np.concatenate([qd, qdd])
+            for s in step * (np.arange(parts) + 0.5 * (1 - parts)):
+                still = answer(here + s * change, torque[k])
+                columns = [answer(here + s * change, torque[k] + unit_torque) - still for unit_torque in np.eye(n)]
+                tau = torque[k] + np.linalg.solve(np.transpose(columns), qdd - still)
                 needed[k] += tau / parts
                 if content["memory"] or content["gears"]:  # nothing else is carried from one instant to the next
-                    unit.setReal(taus, tau.tolist())
-                    unit.doStep(currentCommunicationPoint=k * motion.dt + s, communicationStepSize=motion.dt / parts)
+                    later = answer(here + (s + step) * change, tau)
+                    # At the end of the step, where states advance, the acceleration is the given one.
+                    answer(here + s * change, tau + np.linalg.solve(np.transpose(columns), qdd - later))
+                    unit.doStep(currentCommunicationPoint=k * motion.dt + s, communicationStepSize=step)
         unit.terminate()
         unit.freeInstance()
     return ProgramRun(f"FMPy {version('fmpy')}", needed)

@@ -19,8 +19,8 @@ TOLERANCE = 1e-8
 """Relative and absolute tolerance of the integration, unless the experiment gives another one."""
 
 GEAR_STEP_S = 1e-4
-"""Period at which links in elastic gears or backlash are advanced, s: two masses on a prismatic axis move as exactly
-simulated to 0.2 % (resonance at 15 Hz) and 1 % (gap of 2 mm); at 1 ms, a motor of 5 % of the inertia is wrong by 12 %."""
+"""Period at which links advance in elastic or loose gears, s. Two masses then move as in steps of 2 us to 0.1 % (15 Hz)
+and 1 % (gap of 2 mm), if the motor has 5 % of the inertia; at 1 ms it is 1 % and 12 %."""
 
 OPTIONS = ("-std=c99", "-O2", "-fPIC", "-shared")
 """Options of the compiler."""

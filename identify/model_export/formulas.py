@@ -297,7 +297,8 @@ def instant_model(arm: ArmModel, theta: Floats, duration: float) -> InstantModel
     memory: list[Memory] = []
     gears: dict[int, Gear] = {}
     known = replace(arm, anchor=theta.copy())
-    anywhere = known.motion(*np.zeros((3, 1, arm.n)), dt=PERIOD)
+    still = np.zeros((1, arm.n))
+    anywhere = known.motion(still, still, still, dt=PERIOD)
     first = len(arm.names) - arm.e
     for number, term in _numbered_terms(arm):
         values = theta[first : first + len(term.names)].copy()

@@ -66,11 +66,9 @@ def model_with(name: str) -> ExportedModel:
     theta[len(arm.names) - arm.e :] = 0.0
     if values and math.isnan(values[0]):
         rotors = np.array([each.startswith("ia") for each in arm.names])
-        mean = float(
-            arm.mass_matrix(np.where(rotors, 0.0, theta), np.random.default_rng(1).uniform(-3, 3, (64, 6)))[
-                :, 1, 1
-            ].mean()
-        )
+        still = np.zeros((1, arm.n))
+        postures = arm.motion(still, still, still, dt=1.0).postures
+        mean = float(arm.mass_matrix(np.where(rotors, 0.0, theta), postures)[:, 1, 1].mean())
         values = (1.0 / ((mean - shapes["rotor"]) * (2.0 * np.pi * RESONANCE_HZ) ** 2),)
     theta[len(arm.names) - arm.e :] = values
     return exported(robot, theta)

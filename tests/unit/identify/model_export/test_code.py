@@ -192,7 +192,7 @@ def test_what_code_cannot_hold_stands_on_the_sheet_and_in_the_file(tmp_path: Pat
     assert ["encoder_eccentricity" in each.part for each in sheet.omitted] == [True]
     assert any("spring" in part for part in sheet.held)
     head = files[0].read_text().split('"""')[1]
-    assert "Not in this file: backlash" in " ".join(head.split())
+    assert "Not in this file: an eccentric encoder" in " ".join(head.split())
     assert "SHA-256" in head
 
 
