@@ -65,10 +65,11 @@ def model_with(name: str) -> ExportedModel:
     theta = random_parameters(arm, np.random.default_rng(5), friction=True)
     theta[len(arm.names) - arm.e :] = 0.0
     if values and math.isnan(values[0]):
-        rotors = np.array([each.startswith("ia") for each in arm.names])
+        # Links as torques determine them: with rotor inertias that cannot be told from theirs.
+        links = np.where(arm.of_links, arm.standard_from_base(arm.base.regroup @ theta), 0.0)
         still = np.zeros((1, arm.n))
         postures = arm.motion(still, still, still, dt=1.0).postures
-        mean = float(arm.mass_matrix(np.where(rotors, 0.0, theta), postures)[:, 1, 1].mean())
+        mean = float(arm.mass_matrix(links, postures)[:, 1, 1].mean())
         values = (1.0 / ((mean - shapes["rotor"]) * (2.0 * np.pi * RESONANCE_HZ) ** 2),)
     theta[len(arm.names) - arm.e :] = values
     return exported(robot, theta)
