@@ -30,8 +30,8 @@ WIDTH = 100
 """Width of a line of text in the head of a file."""
 
 LEAST_MOTOR = 0.01
-"""Least share of the mass matrix that belongs to motors whose links move in their gears: with less, a motor turns ten
-times as fast as its link, and the steps of a simulation are too long."""
+"""Least share of the mass matrix that is left to motors whose links move in their gears: with less, motor and link
+swing at more than ten times the resonance of the link, too fast for the steps of a simulation."""
 
 _TEMPLATES = Environment(
     loader=PackageLoader("armident.identify.model_export", "templates"),
@@ -117,7 +117,7 @@ def code_of(model: ExportedModel, format_name: str) -> Code:
     possible = all(gear.share > 0.0 for gear in instant.gears.values())
     if format_name == "fmu" and possible:
         instant = replace(instant, gears={number: gear.of_bodies for number, gear in instant.gears.items()})
-    if not possible or not _motors_have_inertia(model.arm, instant):
+    if instant.gears and not (possible and _motors_have_inertia(model.arm, instant)):
         gears = ", ".join(model.effects[number].title for number in instant.gears)
         remarks.append(f"{gears}: forward dynamics need an inertia of the motor (ia of the joint, rotor of the effect)")
         if format_name == "fmu":
