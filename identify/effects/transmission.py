@@ -1,6 +1,7 @@
 """Effects between motor and joint: elasticity, backlash, cogging."""
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,31 @@ DAMPINGS = (0.1, 0.7)
 LEAST_INERTIA = 0.04
 """Lower bound of the link inertia, over its maximum along the motion: a fit may make it negative. It is the least of
 640 joints in random postures (arms with random bodies on the shipped kinematics)."""
+
+
+class Gear(NamedTuple):
+    """Equation of the motion ``x`` of a link relative to its motor.
+
+    ``inertia x'' + damping x' + stiffness x = share (rotor qdd - load)``, within ``limit`` where there is no stiffness.
+    ``load``: torque of the links, N m or N; ``inertia``: that of the link less ``rotor``, at least ``least``, kg m^2 or
+    kg; ``x`` and ``limit``, rad or m.
+    """
+
+    joint: int
+    rotor: float
+    least: float
+    share: float
+    damping: float
+    stiffness: float
+    limit: float
+
+    @property
+    def of_bodies(self) -> "Gear":
+        """Equation of two bodies with the same compliance or gap: the whole load moves the link."""
+        share = self.share
+        return self._replace(
+            share=1.0, damping=self.damping / share, stiffness=self.stiffness / share, limit=self.limit / share
+        )
 
 
 class MotorOrder(Periodic):
@@ -106,7 +132,15 @@ class JointElasticity(TorqueDependent):
         return 0.5 / (inertia * (2 * np.pi * shapes["frequency"]) ** 2) if inertia > 0.0 else 0.0
 
     def _usual(self, motion: Motion, joint: int, rotor: float) -> float:
-        return float(motion.model.mass_matrix(motion.links, motion.postures)[:, joint, joint].mean()) - rotor
+        return float(_at_postures(motion, joint, rotor).mean())
+
+    def gear(self, motion: Motion, place: Place, shapes: Mapping[str, float], compliance: float) -> Gear:
+        """Return the equation that `swinging` solves."""
+        j, rotor, w = place.joint, shapes["rotor"], 2 * np.pi * shapes["frequency"]
+        least = LEAST_INERTIA * float(_at_postures(motion, j, rotor).max())
+        usual = max(self._usual(motion, j, rotor), least)
+        stiffness = usual * w * w
+        return Gear(j, rotor, least, stiffness * compliance, 2 * shapes["damping"] * w * usual, stiffness, 0.0)
 
     def trial_values(self, motion: Motion, place: Place) -> Trials:
         """Return resonance frequencies up to a fifth of the sampling rate, `DAMPINGS` and `rotors`."""
@@ -158,6 +192,11 @@ class Backlash(TorqueDependent):
         moves = crossing(falls(motion, j, rotor), shapes["gap"], motion.dt)
         return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
 
+    def gear(self, motion: Motion, place: Place, shapes: Mapping[str, float], behind: float) -> Gear:
+        """Return the equation that `crossing` solves."""
+        least = LEAST_INERTIA * float(_at_postures(motion, place.joint, shapes["rotor"]).max())
+        return Gear(place.joint, shapes["rotor"], least, behind, 0.0, 0.0, 0.5 * abs(behind) * shapes["gap"])
+
     def trial_values(self, motion: Motion, place: Place) -> Trials:
         """Return gaps that the link crosses in 5 to 100 ms under the usual load, and `rotors`."""
         usual = max(float(np.std(falls(motion, place.joint))), 1e-9)
@@ -201,3 +240,9 @@ def inertias(motion: Motion, joint: int, rotor: float) -> Array:
     inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
     believed: Array = np.maximum(inertia, LEAST_INERTIA * inertia.max())
     return believed
+
+
+def _at_postures(motion: Motion, joint: int, rotor: float) -> Array:
+    """Return that inertia (P,) at `Motion.postures`, without a lower bound."""
+    inertia: Array = motion.model.mass_matrix(motion.links, motion.postures)[:, joint, joint] - rotor
+    return inertia

@@ -9,6 +9,7 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from armident.identify.documents.base import versions
@@ -20,12 +21,17 @@ from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.formulas import FUNCTIONS, InstantModel, instant_model
 from armident.identify.model_export.rigid_effects import with_rigid_effects
 from armident.identify.model_export.sheet import PARTS, LimitationSheet, limitation_sheet
+from armident.identify.robot.arm import ArmModel
 
 EVERY_PART = (*PARTS, "couplings", "gravity")
 """Parts of a model that code holds."""
 
 WIDTH = 100
 """Width of a line of text in the head of a file."""
+
+LEAST_MOTOR = 0.01
+"""Least share of the mass matrix that is left to motors whose links move in their gears: with less, motor and link
+swing at more than ten times the resonance of the link, too fast for the steps of a simulation."""
 
 _TEMPLATES = Environment(
     loader=PackageLoader("armident.identify.model_export", "templates"),
@@ -82,7 +88,8 @@ def write_supplement(model: ExportedModel, file: Path, sheet: LimitationSheet, p
     """
     code, rigid = code_of(model, "python"), sheet.holds.issuperset(EVERY_PART)
     effects = [effect for effect in code.content["effects"] if effect["number"] not in sheet.effects]
-    if rigid and not effects:
+    gears = {number: gear for number, gear in code.content["gears"].items() if number not in sheet.effects}
+    if rigid and not effects and not gears:
         return None
     frames, name = with_rigid_effects(model)[0].frames, _safe(file.name)
     rotors = [joint.rotor_inertia if "rotor inertia" in sheet.holds else 0.0 for joint in model.joints]
@@ -94,9 +101,8 @@ def write_supplement(model: ExportedModel, file: Path, sheet: LimitationSheet, p
     }
     title = f"Joint torques of the robot {model.robot.name} that {name} lacks."
     head = {"title": title, "lines": code.content["head"]["lines"]}
-    write_atomically(
-        path, code.render("model.py.jinja", feed_forward=False, supplement=supplement, effects=effects, head=head)
-    )
+    lacking = {"supplement": supplement, "effects": effects, "gears": gears, "head": head}
+    write_atomically(path, code.render("model.py.jinja", feed_forward=False, **lacking))
     # Omissions with a reason are corrections of recordings, which are no torques of the arm.
     lost = [each.part for each in sheet.omitted if each in code.sheet.omitted and not each.reason]
     instead = "" if rigid else ", with dry friction instead of that of the program"
@@ -107,6 +113,15 @@ def write_supplement(model: ExportedModel, file: Path, sheet: LimitationSheet, p
 def code_of(model: ExportedModel, format_name: str) -> Code:
     """Return names, tables and formulas of a model. ``format_name``: format for the sheet."""
     instant = instant_model(model.arm, model.theta, model.recorded_s)
+    remarks = _remarks(model, instant)
+    possible = all(gear.share > 0.0 for gear in instant.gears.values())
+    if format_name == "fmu" and possible:
+        instant = replace(instant, gears={number: gear.of_bodies for number, gear in instant.gears.items()})
+    if instant.gears and not (possible and _motors_have_inertia(model.arm, instant)):
+        gears = ", ".join(model.effects[number].title for number in instant.gears)
+        remarks.append(f"{gears}: forward dynamics need an inertia of the motor (ia of the joint, rotor of the effect)")
+        if format_name == "fmu":
+            instant = replace(instant, held=instant.held - set(instant.gears), gears={})
     values, chain = model.arm.values(instant.theta), model.arm.chain
     friction = zip(values.ia, values.fv, values.fc, values.off, values.smoothing, strict=True)
     couplings = [
@@ -125,7 +140,7 @@ def code_of(model: ExportedModel, format_name: str) -> Code:
         format_name,
         EVERY_PART,
         effects=[effect for number, effect in enumerate(model.effects) if number in instant.held],
-        remarks=_remarks(model, instant),
+        remarks=remarks,
     )
     name = identifier(model.robot.name)
     content = {
@@ -141,6 +156,7 @@ def code_of(model: ExportedModel, format_name: str) -> Code:
         "couplings": couplings,
         "effects": effects,
         "memory": instant.memory,
+        "gears": instant.gears,
         "functions": sorted(
             {"atan", "cos", "pi", "sin"} | {f for f in FUNCTIONS if any(f"{f}(" in t for t in formulas)}
         ),
@@ -180,6 +196,19 @@ def _head(model: ExportedModel, sheet: LimitationSheet) -> list[str]:
 def _safe(line: str) -> str:
     """Return a line that ends neither a comment of C nor a string of Python."""
     return line.replace("*/", "* /").replace("\\", "/").replace('"', "'")
+
+
+def _motors_have_inertia(arm: ArmModel, instant: InstantModel) -> bool:
+    """Return True if links that move in their gears leave `LEAST_MOTOR` of the mass matrix to the motors."""
+    still = np.zeros((1, arm.n))
+    theta, postures = instant.theta, arm.motion(still, still, still, dt=1.0).postures
+    mass, links = (arm.mass_matrix(each, postures) for each in (theta, np.where(arm.of_links, theta, 0.0)))
+    left = mass.copy()
+    for gear in instant.gears.values():
+        felt = links[:, gear.joint] - gear.rotor * np.eye(arm.n)[gear.joint]
+        share = gear.share / np.maximum(felt[:, gear.joint], gear.least)
+        left -= share[:, None, None] * felt[:, :, None] * felt[:, None, :]
+    return bool(np.linalg.eigvals(np.linalg.solve(mass, left)).real.min() >= LEAST_MOTOR)
 
 
 def _remarks(model: ExportedModel, instant: InstantModel) -> list[str]:

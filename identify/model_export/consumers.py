@@ -16,7 +16,7 @@ from armident.configs import ConfigError
 from armident.identify.documents.base import versions
 from armident.identify.model_export.code_writer import code_of
 from armident.identify.model_export.exported_model import ExportedModel
-from armident.identify.model_export.fmu_writer import compiled
+from armident.identify.model_export.fmu_writer import GEAR_STEP_S, compiled
 from armident.identify.model_export.sdf_writer import joint_name
 from armident.identify.robot.chain import Floats
 
@@ -66,16 +66,16 @@ class ProgramRun:
 
 def run_python(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:
     """Call the Python module."""
-    return ProgramRun(f"Python {versions()['python']}", module_torque(model, files[0], motion, "inverse_dynamics"))
+    return ProgramRun(f"Python {versions()['python']}", module_torque(files[0], motion, "inverse_dynamics"))
 
 
-def module_torque(model: ExportedModel, file: Path, motion: GivenMotion, function: str = "supplement") -> Floats:
+def module_torque(file: Path, motion: GivenMotion, function: str = "supplement") -> Floats:
     """Return the torques (N, n) by a function of a Python module."""
     module, torque = _module(file), []
-    memory = [0.0] * len(code_of(model, "python").content["memory"])
+    memory = [0.0] * getattr(module, "MEMORY", 0)
     for row in motion.rows:
         q, qd, qdd = (x.tolist() for x in row)
-        memory = module.advance(memory, qd, motion.dt) if memory else memory
+        memory = module.advance(memory, q, qd, qdd, motion.dt) if memory else memory
         torque.append(getattr(module, function)(q, qd, qdd, *([memory] if memory else ())))
     return np.array(torque)
 
@@ -120,10 +120,12 @@ def _module(file: Path) -> ModuleType:
 
 
 def run_fmu(model: ExportedModel, files: Sequence[Path], motion: GivenMotion, torque: Floats) -> ProgramRun:
-    """Give the unit motion and ``torque`` (N, n): wrong accelerations times the mass matrix are its error."""
+    """Let the unit follow a motion: find the torques of its accelerations, near ``torque`` (N, n)."""
     fmpy, fmi2 = _package("fmpy"), _package("fmpy.fmi2", "fmpy")
-    n, mass, wrong = model.arm.n, model.arm.mass_matrix(model.theta, motion.q), np.zeros_like(torque)
-    remembers = bool(code_of(model, "fmu").content["memory"])
+    n, needed, content = model.arm.n, np.zeros_like(torque), code_of(model, "fmu").content
+    # Impacts in a gear are shorter than a sample: their mean torque counts.
+    parts = int(np.ceil(motion.dt / GEAR_STEP_S)) if content["gears"] else 1
+    step = motion.dt / parts
     description = fmpy.read_model_description(str(files[0]))
     with tempfile.TemporaryDirectory() as folder:
         unit = fmi2.FMU2Slave(
@@ -137,15 +139,27 @@ def run_fmu(model: ExportedModel, files: Sequence[Path], motion: GivenMotion, to
         unit.enterInitializationMode()
         unit.exitInitializationMode()
         taus, states, accelerations = list(range(n)), list(range(n, 3 * n)), list(range(3 * n, 4 * n))
+
+        def answer(state: Floats, tau: Floats) -> Floats:
+            unit.setReal(states, state.tolist())
+            unit.setReal(taus, tau.tolist())
+            return np.array(unit.getReal(accelerations))
+
         for k, (q, qd, qdd) in enumerate(motion.rows):
-            unit.setReal(states, [*q, *qd])
-            unit.setReal(taus, torque[k].tolist())
-            wrong[k] = mass[k] @ (qdd - unit.getReal(accelerations))
-            if remembers:  # nothing else is carried from one instant to the next
-                unit.doStep(currentCommunicationPoint=k * motion.dt, communicationStepSize=motion.dt)
+            here, change = np.concatenate([q, qd]), np.concatenate([qd, qdd])
+            for s in step * (np.arange(parts) + 0.5 * (1 - parts)):
+                still = answer(here + s * change, torque[k])
+                columns = [answer(here + s * change, torque[k] + unit_torque) - still for unit_torque in np.eye(n)]
+                tau = torque[k] + np.linalg.solve(np.transpose(columns), qdd - still)
+                needed[k] += tau / parts
+                if content["memory"] or content["gears"]:  # nothing else is carried from one instant to the next
+                    later = answer(here + (s + step) * change, tau)
+                    # At the end of the step, where states advance, the acceleration is the given one.
+                    answer(here + s * change, tau + np.linalg.solve(np.transpose(columns), qdd - later))
+                    unit.doStep(currentCommunicationPoint=k * motion.dt + s, communicationStepSize=step)
         unit.terminate()
         unit.freeInstance()
-    return ProgramRun(f"FMPy {version('fmpy')}", torque + wrong)
+    return ProgramRun(f"FMPy {version('fmpy')}", needed)
 
 
 def run_mjcf(model: ExportedModel, files: Sequence[Path], motion: GivenMotion) -> ProgramRun:

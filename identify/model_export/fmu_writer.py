@@ -18,6 +18,10 @@ from armident.identify.model_export.sheet import LimitationSheet
 TOLERANCE = 1e-8
 """Relative and absolute tolerance of the integration, unless the experiment gives another one."""
 
+GEAR_STEP_S = 1e-4
+"""Period at which links advance in elastic or loose gears, s. Two masses then move as in steps of 2 us to 0.1 % (15 Hz)
+and 1 % (gap of 2 mm), if the motor has 5 % of the inertia; at 1 ms it is 1 % and 12 %."""
+
 OPTIONS = ("-std=c99", "-O2", "-fPIC", "-shared")
 """Options of the compiler."""
 
@@ -48,6 +52,7 @@ def write_fmu(model: ExportedModel, path: Path) -> tuple[list[Path], LimitationS
     interface = {
         "guid": f"{{{uuid.uuid5(uuid.NAMESPACE_URL, source)}}}",
         "tolerance": TOLERANCE,
+        "period": GEAR_STEP_S if code.content["gears"] else 1e-3,
         "start": start,
         "variables": variables,
         "outputs": [k for k, v in enumerate(variables, start=1) if v.causality == "output"],

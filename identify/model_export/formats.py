@@ -71,7 +71,8 @@ def export_model(
         files, sheet = chosen.write(model, main, *further)
         stem = main.name.removesuffix(chosen.suffix).removesuffix(main.suffix)
         supplement = main.with_name(f"{stem}_{format_name}_supplement.py")
-        completed = write_supplement(model, files[0], sheet, supplement) if sheet.omitted else None
+        lacks = sheet.omitted and format_name != "fmu"  # a plant: no program adds torques to it
+        completed = write_supplement(model, files[0], sheet, supplement) if lacks else None
         if completed is not None:
             files, sheet = [*files, supplement], completed
         if motion is not None and format_name in RUNNERS:

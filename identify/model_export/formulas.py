@@ -2,7 +2,7 @@
 
 An effect's columns are evaluated with symbols that record each operation, as elements of numpy's object arrays. A
 formula is accepted if it has the effect's values along a random motion. Bristles and slow changes are states that relax
-(`Memory`); other effects with memory (backlash) have no formula.
+(`Memory`). Elasticity and backlash are the motion of a link in its gear (`Gear`), which the generated code computes.
 """
 
 import math
@@ -20,6 +20,7 @@ from armident.identify.effects.link import GravityDirection, across
 from armident.identify.effects.parameter_change import ParameterChange
 from armident.identify.effects.recording_corrections import of_recording
 from armident.identify.effects.terms import Term, effect_terms
+from armident.identify.effects.transmission import Backlash, Gear, JointElasticity
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 from armident.identify.robot.motion import Motion
@@ -273,7 +274,8 @@ class InstantModel:
 
     ``torques``: formulas by number of the effect and joint, N m or N. Symbols: ``q``, ``dq``, ``ddq``; ``sign``, the
     smoothed sign of the velocity; ``load``, torque of the links; ``torque``, that of links, rotors, couplings and
-    friction; ``memory``, the states. ``held``: numbers of the effects that the model contains.
+    friction; ``memory``, the states. ``gears``: elasticity and backlash by number of the effect. ``held``: numbers of
+    the effects that the model contains.
     """
 
     theta: Floats
@@ -281,6 +283,7 @@ class InstantModel:
     torques: dict[int, dict[int, str]]
     held: frozenset[int]
     memory: tuple[Memory, ...]
+    gears: dict[int, Gear]
 
 
 def instant_model(arm: ArmModel, theta: Floats, duration: float) -> InstantModel:
@@ -292,7 +295,10 @@ def instant_model(arm: ArmModel, theta: Floats, duration: float) -> InstantModel
     torques: dict[int, dict[int, str]] = {}
     held: set[int] = set()
     memory: list[Memory] = []
+    gears: dict[int, Gear] = {}
     known = replace(arm, anchor=theta.copy())
+    still = np.zeros((1, arm.n))
+    anywhere = known.motion(still, still, still, dt=PERIOD)
     first = len(arm.names) - arm.e
     for number, term in _numbered_terms(arm):
         values = theta[first : first + len(term.names)].copy()
@@ -311,13 +317,19 @@ def instant_model(arm: ArmModel, theta: Floats, duration: float) -> InstantModel
                 rest = zip(term.kept[len(tilts) :], values[len(tilts) :], strict=True)
                 torque = sum(float(value) * functions[k - len(GravityDirection.linear)] for k, value in rest)
                 torques[number] = {0: _of(torque).text}
+        elif isinstance(term.effect, JointElasticity | Backlash):
+            shapes = {**term.effect.defaults, **term.shapes}
+            gear = term.effect.gear(anywhere, term.place, shapes, float(values[0]))
+            if gear.least <= 0.0:  # no inertia is left to the link
+                continue
+            gears[number] = gear
         else:
             found = _formulas(known, term, values, duration, memory)
             if found is None:
                 continue
             torques[number] = found
         held.add(number)
-    return InstantModel(theta, gravity, torques, frozenset(held), tuple(memory))
+    return InstantModel(theta, gravity, torques, frozenset(held), tuple(memory), gears)
 
 
 def _numbered_terms(arm: ArmModel) -> list[tuple[int, Term]]:

@@ -63,7 +63,7 @@ def measure(model: ExportedModel, format_name: str, files: Sequence[Path], motio
     expected = identified_torque(model, motion)[:: run.every]
     settled = min(round(SETTLED_S / motion.dt / run.every), len(expected) // 5)
     supplement = next((file for file in files if file.name.endswith("_supplement.py")), None)
-    added = 0.0 if supplement is None else consumers.module_torque(model, supplement, motion) - run.dry
+    added = 0.0 if supplement is None else consumers.module_torque(supplement, motion) - run.dry
     compared, title = [expected, run.torque - expected, run.torque + added - expected], motion.title
     period = motion.dt * run.every
     if any(effect.effect == "backlash" for effect in model.effects) and period < 0.5 / IMPACT_BAND_HZ:

@@ -43,7 +43,9 @@ EFFECTS: dict[str, tuple[dict[str, float], tuple[float, ...]]] = {
     "friction_drift": ({"time_constant": 1.5}, (2.0, 1.0)),
     "friction_drift/work": ({"decay": 0.7}, (2.0, 1.0)),
     "joint_elasticity": ({"frequency": RESONANCE_HZ, "damping": 0.1, "rotor": 0.0}, (math.nan,)),
+    "joint_elasticity with its motor": ({"frequency": RESONANCE_HZ, "damping": 0.1, "rotor": 0.25}, (math.nan,)),
     "backlash": ({"gap": 2e-4, "rotor": 0.0}, (1.0,)),
+    "backlash with its motor": ({"gap": 2e-4, "rotor": 0.25}, (1.0,)),
     "cogging_torque": ({"harmonic": 6.0}, (1.5, 1.5)),
     "joint_spring": ({}, (20.0,)),
 }
@@ -63,13 +65,12 @@ def model_with(name: str) -> ExportedModel:
     theta = random_parameters(arm, np.random.default_rng(5), friction=True)
     theta[len(arm.names) - arm.e :] = 0.0
     if values and math.isnan(values[0]):
-        rotors = np.array([each.startswith("ia") for each in arm.names])
-        mean = float(
-            arm.mass_matrix(np.where(rotors, 0.0, theta), np.random.default_rng(1).uniform(-3, 3, (64, 6)))[
-                :, 1, 1
-            ].mean()
-        )
-        values = (1.0 / (mean * (2.0 * np.pi * RESONANCE_HZ) ** 2),)
+        # Links as torques determine them: with rotor inertias that cannot be told from theirs.
+        links = np.where(arm.of_links, arm.standard_from_base(arm.base.regroup @ theta), 0.0)
+        still = np.zeros((1, arm.n))
+        postures = arm.motion(still, still, still, dt=1.0).postures
+        mean = float(arm.mass_matrix(links, postures)[:, 1, 1].mean())
+        values = (1.0 / ((mean - shapes["rotor"]) * (2.0 * np.pi * RESONANCE_HZ) ** 2),)
     theta[len(arm.names) - arm.e :] = values
     return exported(robot, theta)
 

@@ -29,16 +29,17 @@ Floats = NDArray[np.float64]
 TOLERANCE = 1e-12
 """Largest difference of torques, relative to the largest of the joint: rounding of another order of operations."""
 
-NO_FORMULA = {
-    "joint_elasticity", "backlash", "time_delay", "actuator_bandwidth", "encoder_eccentricity", "unnamed/time",
-    "unnamed/time_and_direction",
-}  # fmt: skip
-"""Effects whose memory is no state that relaxes, or with derivatives of the torque."""
+NO_FORMULA = {"time_delay", "actuator_bandwidth", "encoder_eccentricity", "unnamed/time", "unnamed/time_and_direction"}
+"""Effects with derivatives of the torque, or of the time of the recordings."""
 
 STATES = {"presliding_friction", "friction_drift", "friction_drift/work"}
 """Effects with a state that relaxes."""
 
-MEMORYLESS = {key for key, effect in catalogue().items() if not isinstance(effect, SignalMistake)} - NO_FORMULA - STATES
+GEARS = {"joint_elasticity", "backlash"}
+"""Effects with a link that moves relative to its motor."""
+
+MEMORYLESS = {key for key, effect in catalogue().items() if not isinstance(effect, SignalMistake)}
+MEMORYLESS -= NO_FORMULA | STATES | GEARS
 """All others: their torque depends on the present instant alone."""
 
 RECORDED_S = 20.0
@@ -142,7 +143,7 @@ def test_an_effect_without_memory_has_formulas(key: str) -> None:
 
 
 @pytest.mark.parametrize("key", sorted(NO_FORMULA))
-def test_an_effect_with_another_memory_has_none(key: str) -> None:
+def test_an_effect_of_more_than_an_instant_has_none(key: str) -> None:
     robot = with_effect(load_robot("tx40"), key)
     found = instant_model(arm_model(robot), parameters(robot, np.random.default_rng(5)), RECORDED_S)
     assert (found.held, found.torques) == (frozenset(), {})
@@ -185,13 +186,13 @@ def test_code_with_effects_has_the_torques_of_the_model(keys: list[str], tmp_pat
 
 
 def test_what_code_cannot_hold_stands_on_the_sheet_and_in_the_file(tmp_path: Path) -> None:
-    robot = with_effect(load_robot("tx40"), "backlash", "joint_spring")
+    robot = with_effect(load_robot("tx40"), "encoder_eccentricity", "joint_spring")
     model = exported(robot, parameters(robot, np.random.default_rng(5)))
     files, sheet = export_model(model, "python", tmp_path / "model.py")
-    assert ["backlash" in each.part for each in sheet.omitted] == [True]
+    assert ["encoder_eccentricity" in each.part for each in sheet.omitted] == [True]
     assert any("spring" in part for part in sheet.held)
     head = files[0].read_text().split('"""')[1]
-    assert "Not in this file: backlash" in " ".join(head.split())
+    assert "Not in this file: an eccentric encoder" in " ".join(head.split())
     assert "SHA-256" in head
 
 

@@ -136,8 +136,8 @@ def test_drake_has_an_elastic_joint_as_two_joints(tmp_path: Path) -> None:
     model = model_with("joint_elasticity")
     sheet = sheet_of(model, "sdf", tmp_path)
     assert any("an elastic joint" in part for part in sheet.held)
-    # Without the second joint, the torques of the Python module lack the effect.
-    assert figures(sheet)[1] < 0.5 * of_python(model, tmp_path)
+    # Without the second joint, the torques would lack the effect, 1.5 %.
+    assert figures(sheet)[1] < 0.45
 
 
 def test_mujoco_gets_the_effects_alone_that_it_lacks(tmp_path: Path) -> None:
@@ -159,12 +159,12 @@ def test_a_file_that_lacks_nothing_has_no_module(tmp_path: Path) -> None:
 
 
 def test_the_page_names_the_module_its_figure_and_its_gaps(tmp_path: Path) -> None:
-    model = tx40_with(Effect(effect="backlash", joint="joint_2", parameters={"gap": 1e-3, "rotor": 0.0}), values=(1.0,))
+    model = tx40_with(Effect(effect="time_delay", joint="joint_2"), values=(1e-3,))
     sheet = sheet_of(model, "urdf", tmp_path)
     page = (tmp_path / "tx40_urdf_limits.md").read_text()
     assert re.search(r"and by [0-9.]+ % with the torques of tx40_urdf_supplement\.py", page)
     assert "tx40_urdf_supplement.py computes the torques that the file lacks" in page
-    assert "not: backlash of the gear (backlash) of joint_2" in page
+    assert "not: a delay of the recorded torque (time_delay) of joint_2" in page
     assert sheet.document()["measured"]["supplement"] == "tx40_urdf_supplement.py"
     assert figures(sheet)[1] < figures(sheet)[0]
 
