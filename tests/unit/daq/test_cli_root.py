@@ -45,6 +45,11 @@ def greet(name: Annotated[str, typer.Option(help="Whom to greet.")] = "arm") -> 
     print(f"hello {name}")
 
 
+def join(words: Annotated[str, typer.Option(metavar="WORD,...")] = "", name: str = "arm") -> None:
+    """Print the words that are given."""
+    print(words, name)
+
+
 def compile_while_interrupted() -> None:
     """Lose an interrupt in a callback, as a compiler does, and fail for that reason."""
     with suppress(KeyboardInterrupt):
@@ -55,7 +60,12 @@ def compile_while_interrupted() -> None:
 
 ENTRIES = [
     importlib.metadata.EntryPoint(name, f"{__name__}:{function}", GROUP)
-    for name, function in [("refuse", "refuse"), ("greet", "greet"), ("compile", "compile_while_interrupted")]
+    for name, function in [
+        ("refuse", "refuse"),
+        ("greet", "greet"),
+        ("join", "join"),
+        ("compile", "compile_while_interrupted"),
+    ]
 ]
 ABSENT = importlib.metadata.EntryPoint("absent", "daq.no_such_module:absent", GROUP)
 
@@ -118,6 +128,14 @@ def test_a_command_chooses_its_own_exit_code() -> None:
 
 def test_options_reach_the_command() -> None:
     assert call("greet", "--name", "robot") == (0, "hello robot\n", "")
+
+
+def test_a_list_of_values_that_is_given_twice_is_refused_for_the_last_would_replace_the_first() -> None:
+    assert call("join", "--words", "a=b,c=d", "--name", "x", "--name", "y") == (0, "a=b,c=d y\n", "")
+    for repeated in (["--words=c=d"], ["--words", "a=b"]):
+        code, out, err = call("join", "--words", "a=b", *repeated)
+        assert (code, out) == (2, "")
+        assert "--words is given twice; give all values at once: --words WORD,..." in err
 
 
 @pytest.mark.parametrize("words", [["greet", "--nmae", "x"], ["no-such-command"], ["refuse"], ["--no-such-option"]])
