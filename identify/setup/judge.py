@@ -5,12 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from armident.arrays import Array
 from armident.configs import RobotConfig
-from armident.identify.setup.calibration import CORRECTED, NAMED, probability
+from armident.identify.setup.calibration import CORRECTED, EXTREMES, NAMED, probability
 from armident.identify.setup.contest import LEAST_ERROR, Contest, words_of
 from armident.identify.setup.describe import Described, corrected_robot, described, merged_scales
+from armident.identify.setup.fit import joint_errors
 from armident.identify.setup.plausible import LEAST_ODDS
 from armident.identify.setup.result import WIRED, SetupFinding
 from armident.identify.setup.search import LEAST_DROP, NOT_UNDERSTOOD, STRUCTURED, Search, Step
@@ -76,7 +78,9 @@ def _together(parts: Sequence[Described], good: Sequence[bool]) -> list[Describe
 def _is_likely(finding: SetupFinding, contest: Contest, robot: RobotConfig) -> bool:
     """True for a correction that a diagnosis goes on with, see `SetupCheck`."""
     joints = indices(finding.joints, robot)
-    before, after = (one.errors[contest.own(joints)] for one in (contest.before, contest.after))
+    # At rest, dry friction holds any load: only motion tells one joint from another.
+    hypotheses, own = (contest.found.start, contest.found.h), contest.own(joints)
+    before, after = (joint_errors(contest.bench, h, free=True)[0][own] for h in hypotheses)
     likely = finding.probability >= NAMED and explains(finding.kind, contest, joints)
     return finding.correction or (likely and (finding.kind not in WIRED or bool(np.all(before > LEAST_FALL * after))))
 
@@ -91,6 +95,10 @@ def judged_part(part: Described, contest: Contest, robot: RobotConfig) -> Descri
     if finding.kind == "time_shift" and contest.found.shift_measured:
         # A shift that the references show has the probability of its own estimate: prediction hardly tells it.
         return part
+    if finding.kind == "joint_order" and np.isfinite(gain := contest.found.order_gain):
+        share = float(np.clip(expit(gain), *EXTREMES))
+        message = f"{finding.message}: as recorded, a position passes its limit"
+        return replace(part, finding=replace(finding, probability=share, message=message))
     joints = indices(finding.joints, robot)
     equal = contest.equal(finding.kind, joints)
     share = probability(features_of(finding, contest, joints, equal))
