@@ -19,16 +19,13 @@ from armident.identify.setup.describe import as_configured, effects_line
 from armident.identify.setup.fit import Hypothesis, joint_errors
 from armident.identify.setup.judge import NEXT_STEP, judged_search
 from armident.identify.setup.prior import Mistake
-from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
+from armident.identify.setup.result import LONGEST, SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
 from armident.identify.setup.stationarity import ChangedStretch, change_finding, spans, stretch
-from armident.identify.setup.torque_shift import common_shift, long_torque_shift
+from armident.identify.setup.torque_shift import LONGEST_SHIFT_S, common_shift, long_torque_shift
 from armident.identify.setup.weight import weight_findings
 from armident.identify.setup.zero_offset import zero_offset
 from armident.identify.signals.experiments import Experiment, check_one_rate
-
-LONGEST_SHIFT_S = 0.05
-"""Longest common shift of the torques that references are asked for, s: filters of drives are faster."""
 
 TRIED = {
     "position_sign": "wrong sign of positions, or of positions and torques, of each joint and of all",
@@ -214,8 +211,8 @@ def _searched(
     best = search.run(as_configured(robot))
     if "time_shift" in best.families:
         best = _with_exact_shift(experiments, bench, best)
-    elif moving.sum() > 1 and all(e.q_ref is not None for e in experiments):
-        best = _with_instrumented_shift(experiments, bench, best)
+    elif moving.sum() > 1:
+        best = _with_confirmed_shift(experiments, bench, best)
     return bench, search, best
 
 
@@ -231,11 +228,15 @@ def _with_exact_shift(experiments: Sequence[Experiment], bench: Bench, best: Ste
     return _with_shift(best, bench, (found.samples * bench.period - common) * bench.moving, found)
 
 
-def _with_instrumented_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> Step:
-    """Add a common shift that the recorded references show and the search has not found, if two joints confirm it.
+def _with_confirmed_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> Step:
+    """Add a common shift that the search has not found, if two joints confirm it.
 
-    Disturbances in the closed loop may hide it from prediction, not from the instruments.
+    Disturbances in the closed loop may hide it from prediction, not from instruments by recorded references.
     """
+    if any(e.q_ref is None for e in experiments):
+        near = _torque_shift(experiments, bench, best)
+        if near is None or near.samples <= LONGEST:
+            return best
     found = long_torque_shift(experiments, bench, best.h, 0.0, LONGEST_SHIFT_S)
     if found is None or not found.confirmed:
         return best
@@ -253,7 +254,7 @@ def _with_shift(step: Step, bench: Bench, more_s: NDArray[np.floating], found: T
     mistakes = list(step.mistakes)
     mistakes[last] = replace(mistakes[last], shift=mistakes[last].shift + more_s)
     std = found.std * bench.period
-    return replace(step, mistakes=tuple(mistakes), shift_std=std, shift_measured=found.instrumented)
+    return replace(step, mistakes=tuple(mistakes), shift_std=std, shift_measured=found.instrumented or found.confirmed)
 
 
 def _clipped(

@@ -15,7 +15,7 @@ from armident.configs import DataError
 from armident.identify.regression.ar_noise import ArModel, fit_ar
 from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.fit import Hypothesis
-from armident.identify.setup.result import CONVENTIONS, TorqueShift
+from armident.identify.setup.result import CONVENTIONS, OWN_CAUSE, TorqueShift
 from armident.identify.signals.experiments import Experiment
 
 Motion = tuple[Array, Array, Array]
@@ -41,6 +41,9 @@ LAGS = 16
 RANGE = 5.0
 """Largest shift, samples: longer ones are mistakes of the set-up."""
 
+LONGEST_SHIFT_S = 0.05
+"""Longest of these, and of a shift with a cause of its own at one joint, s: filters of drives are faster."""
+
 ROUNDS = 12
 """Most rounds in which a longer shift is estimated again around the value of the round before."""
 
@@ -49,9 +52,6 @@ CONVERGED = 0.1
 
 STEPS = 2001
 """Values of the shift between these limits: a two-hundredth of a sample apart."""
-
-OWN_CAUSE = 0.2
-"""Prior share of joints whose apparent shift has a cause of its own: at most one joint in five lacks an effect."""
 
 LARGE = 700.0
 """Largest logarithm of odds that is a finite number."""
@@ -79,11 +79,12 @@ def long_torque_shift(
     The estimate is linear: it is repeated with torques moved by the last value until that changes no more.
     """
     first, reach = first_s / bench.period, reach_s / bench.period
+    longest = max(RANGE, reach, LONGEST_SHIFT_S / bench.period)
     shift = first
     for _ in range(ROUNDS):
         try:
             found = _estimated(experiments, bench, h, shift)
-            rest = _common(found, max(RANGE, reach))
+            rest = _common(found, longest)
             experiments = _first_part(experiments, round(MOST_SAMPLES * found.bench.segments[0].dt / bench.period))
         except (DataError, np.linalg.LinAlgError):
             return None
@@ -287,9 +288,10 @@ def _solved(
 
 def _common(found: _Shifts, reach: float) -> TorqueShift:
     """Common shift of the joints; some have effects of their own that look like a shift, such as a slow actuator."""
-    samples, std, bench = found.samples, np.sqrt(np.diag(found.covariance)), found.bench
-    if not (np.isfinite(samples).all() and np.isfinite(std).all()):
+    samples, variance, bench = found.samples, np.diag(found.covariance), found.bench
+    if not (np.isfinite(samples).all() and np.all((variance > 0.0) & np.isfinite(variance))):
         raise np.linalg.LinAlgError("the motion determines no shift of the torques")
+    std = np.sqrt(variance)
 
     def log_likelihood(shift: Array) -> Array:
         apart = (samples - shift[:, None]) / std
