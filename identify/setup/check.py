@@ -208,7 +208,7 @@ def _searched(
 ) -> tuple[Bench, Search, Step]:
     bench = make_bench(experiments, robot, moving)
     search = Search(bench)
-    best = search.run(as_configured(robot))
+    best = search.within_limits(search.run(as_configured(robot)))
     if "time_shift" in best.families:
         best = _with_exact_shift(experiments, bench, best)
     elif moving.sum() > 1:
