@@ -89,12 +89,10 @@ class _Command(TyperCommand):
     """A command that refuses a list of values, ``NAME,...``, that is given twice: the last would replace the first."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Return what is left of the arguments, after the check."""
         given = self.make_parser(ctx).parse_args(args=list(args))[2]
         for option in given:
-            if (getattr(option, "metavar", None) or "").endswith(",...") and given.count(option) > 1:
-                flag, form = option.opts[0], option.metavar
-                raise typer.BadParameter(f"{flag} is given twice; give all values at once: {flag} {form}", ctx)
+            if (option.metavar or "").endswith(",...") and given.count(option) > 1:
+                raise typer.BadParameter(f"{option.opts[0]} is given twice; give it once: {option.metavar}", ctx)
         return super().parse_args(ctx, args)
 
 

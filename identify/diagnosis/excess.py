@@ -80,21 +80,17 @@ class Excess:
 
 
 def spectral_excess(
-    series: Sequence[Array],
-    velocities: Sequence[Array],
-    dt: float,
-    slow: float = 0.0,
-    refitted: Sequence[Array | None] = (),
+    series: Sequence[Array], velocities: Sequence[Array], dt: float, slow: float = 0.0, taken: Sequence[Array] = ()
 ) -> Excess | None:
     """Band of frequencies with most power over what noise of drives and encoders has there; each series is evidence.
 
     ``series``: residuals (M,) of one joint in the band of the comparison, zero at rest. Times about reversals and under
     the velocity ``slow``, where dry friction has no model, are left out. The band is that of the series with most power
-    beyond noise: a signal need not be in every recording. ``refitted``: directions (M, k), orthonormal in all series
+    beyond noise: a signal need not be in every recording. ``taken``: directions (M, k), orthonormal in all series
     together, that a fit has taken out of them.
     """
-    taken = refitted or [None] * len(series)
-    each = [_in_series(e, qd, dt, slow, own) for e, qd, own in zip(series, velocities, taken, strict=True)]
+    out = taken or [np.empty((e.size, 0)) for e in series]
+    each = [_in_series(e, qd, dt, slow, own) for e, qd, own in zip(series, velocities, out, strict=True)]
     found = [one for one in each if one is not None]
     if not found:
         return None
@@ -108,12 +104,12 @@ def fisher(p_values: Iterable[float]) -> float:
     return float(chdtrc(2 * len(logarithms), -2.0 * sum(logarithms)))
 
 
-def _in_series(e: Array, qd: Array, dt: float, slow: float, taken: Array | None) -> Excess | None:
+def _in_series(e: Array, qd: Array, dt: float, slow: float, taken: Array) -> Excess | None:
     """Return the excess of one series (M,); ``None`` if it is short or at rest."""
     (away,) = away_from_reversals([e], [qd], slow)
     window = hann_window(e.size)
     power = periodogram(window * away)
-    kept = np.ones(power.size) if taken is None else _kept(window * (away != 0.0), taken)
+    kept = _kept(window * (away != 0.0), taken)
     power /= np.maximum(kept, LEAST_KEPT)
     f = np.arange(power.size) / (e.size * dt)
     used = np.flatnonzero((f > 0.0) & (f < HIGHEST * 0.5 / dt) & (kept >= LEAST_KEPT))

@@ -12,7 +12,6 @@ from armident.configs import RobotConfig
 from armident.identify.setup.calibration import CORRECTED, EXTREMES, NAMED, probability
 from armident.identify.setup.contest import LEAST_ERROR, Contest, words_of
 from armident.identify.setup.describe import Described, corrected_robot, described, merged_scales
-from armident.identify.setup.fit import joint_errors
 from armident.identify.setup.plausible import LEAST_ODDS
 from armident.identify.setup.result import WIRED, SetupFinding
 from armident.identify.setup.search import LEAST_DROP, NOT_UNDERSTOOD, STRUCTURED, Search, Step
@@ -78,9 +77,7 @@ def _together(parts: Sequence[Described], good: Sequence[bool]) -> list[Describe
 def _is_likely(finding: SetupFinding, contest: Contest, robot: RobotConfig) -> bool:
     """True for a correction that a diagnosis goes on with, see `SetupCheck`."""
     joints = indices(finding.joints, robot)
-    # At rest, dry friction holds any load: only motion tells one joint from another.
-    hypotheses, own = (contest.found.start, contest.found.h), contest.own(joints)
-    before, after = (joint_errors(contest.bench, h, free=True)[0][own] for h in hypotheses)
+    before, after = (errors[contest.own(joints)] for errors in contest.in_motion)
     likely = finding.probability >= NAMED and explains(finding.kind, contest, joints)
     return finding.correction or (likely and (finding.kind not in WIRED or bool(np.all(before > LEAST_FALL * after))))
 
@@ -96,12 +93,11 @@ def judged_part(part: Described, contest: Contest, robot: RobotConfig) -> Descri
         # A shift that the references show has the probability of its own estimate: prediction hardly tells it.
         return part
     if finding.kind == "joint_order" and np.isfinite(gain := contest.found.order_gain):
-        share = float(np.clip(expit(gain), *EXTREMES))
-        message = f"{finding.message}: as recorded, a position passes its limit"
-        return replace(part, finding=replace(finding, probability=share, message=message))
+        odds, message = np.clip(expit(gain), *EXTREMES), f"{finding.message}: as recorded, a position passes its limit"
+        return replace(part, finding=replace(finding, probability=float(odds), message=message))
     joints = indices(finding.joints, robot)
     equal = contest.equal(finding.kind, joints)
-    share = probability(features_of(finding, contest, joints, equal))
+    share = probability(contest.features(contest.log_odds(finding.kind, joints, equal)))
     correction = share > CORRECTED and explains(finding.kind, contest, joints)
     message = finding.message
     if equal:
@@ -118,14 +114,9 @@ def explains(kind: str, contest: Contest, joints: Sequence[int]) -> bool:
     if _lost(after.errors[own], after.memory[own]).any():
         return False
     # A wrong scale of one joint shows at the others that carry the same links.
-    falls = np.any(contest.before.errors[moving] > LEAST_FALL * after.errors[moving])
+    falls = np.any(contest.in_motion[0][moving] > LEAST_FALL * contest.in_motion[1][moving])
     # A common unit shows in the limits only, a common shift in the phase.
     return bool(falls) or contest.more_plausible >= LEAST_ODDS or kind == "time_shift"
-
-
-def features_of(finding: SetupFinding, contest: Contest, joints: Sequence[int], equal: Sequence[Step]) -> Array:
-    """Features of a finding of the joints, see `calibration.FEATURES`. ``equal``: set-ups that explain as much."""
-    return contest.features(contest.log_odds(finding.kind, joints, equal))
 
 
 def _doubtful(part: Described, contest: Contest, robot: RobotConfig) -> SetupFinding:

@@ -79,12 +79,11 @@ def long_torque_shift(
     The estimate is linear: it is repeated with torques moved by the last value until that changes no more.
     """
     first, reach = first_s / bench.period, reach_s / bench.period
-    longest = max(RANGE, reach, LONGEST_SHIFT_S / bench.period)
     shift = first
     for _ in range(ROUNDS):
         try:
             found = _estimated(experiments, bench, h, shift)
-            rest = _common(found, longest)
+            rest = _common(found, max(RANGE, reach, LONGEST_SHIFT_S / bench.period))
             experiments = _first_part(experiments, round(MOST_SAMPLES * found.bench.segments[0].dt / bench.period))
         except (DataError, np.linalg.LinAlgError):
             return None

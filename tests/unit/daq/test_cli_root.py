@@ -135,7 +135,7 @@ def test_a_list_of_values_that_is_given_twice_is_refused_for_the_last_would_repl
     for repeated in (["--words=c=d"], ["--words", "a=b"]):
         code, out, err = call("join", "--words", "a=b", *repeated)
         assert (code, out) == (2, "")
-        assert "--words is given twice; give all values at once: --words WORD,..." in err
+        assert "--words is given twice; give it once: WORD,..." in err
 
 
 @pytest.mark.parametrize("words", [["greet", "--nmae", "x"], ["no-such-command"], ["refuse"], ["--no-such-option"]])

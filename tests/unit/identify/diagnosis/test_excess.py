@@ -51,8 +51,8 @@ def test_noise_that_a_refit_has_left_is_no_signal_beside_what_it_took() -> None:
     unknown: list[float] = []
     for seed in range(30):
         left, taken = without_slow_parts(noise(seed, 0.03)[:300])
-        for p_values, refitted in ((known, [taken]), (unknown, [])):
-            found = spectral_excess([left], [SPEED[:300]], DT, refitted=refitted)
+        for p_values, out in ((known, [taken]), (unknown, [])):
+            found = spectral_excess([left], [SPEED[:300]], DT, taken=out)
             assert found is not None
             p_values.append(found.p_value)
     # Of 30 p-values 0.3 are below 0.01; five or more have a probability of 2e-5.
@@ -61,7 +61,7 @@ def test_noise_that_a_refit_has_left_is_no_signal_beside_what_it_took() -> None:
 
 def test_a_vibration_beside_a_refit_has_its_frequency() -> None:
     left, taken = without_slow_parts((noise(1, 0.03) + 1.5 * np.sin(2 * np.pi * 8.3 * T))[:300])
-    found = spectral_excess([left], [SPEED[:300]], DT, refitted=[taken])
+    found = spectral_excess([left], [SPEED[:300]], DT, taken=[taken])
     assert found is not None
     assert found.where[0] == pytest.approx(8.3, abs=0.2)
     assert found.p_value < 1e-6
