@@ -19,7 +19,7 @@ from armident.identify.setup.describe import as_configured, effects_line
 from armident.identify.setup.fit import Hypothesis, joint_errors
 from armident.identify.setup.judge import NEXT_STEP, judged_search
 from armident.identify.setup.prior import Mistake
-from armident.identify.setup.result import LONGEST, SetupCheck, SetupFinding, TorqueShift
+from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
 from armident.identify.setup.stationarity import ChangedStretch, change_finding, spans, stretch
 from armident.identify.setup.torque_shift import LONGEST_SHIFT_S, common_shift, long_torque_shift
@@ -211,8 +211,8 @@ def _searched(
     best = search.within_limits(search.run(as_configured(robot)))
     if "time_shift" in best.families:
         best = _with_exact_shift(experiments, bench, best)
-    elif moving.sum() > 1:
-        best = _with_confirmed_shift(experiments, bench, best)
+    elif moving.sum() > 1 and all(e.q_ref is not None for e in experiments):
+        best = _with_instrumented_shift(experiments, bench, best)
     return bench, search, best
 
 
@@ -228,15 +228,11 @@ def _with_exact_shift(experiments: Sequence[Experiment], bench: Bench, best: Ste
     return _with_shift(best, bench, (found.samples * bench.period - common) * bench.moving, found)
 
 
-def _with_confirmed_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> Step:
-    """Add a common shift that the search has not found, if two joints confirm it.
+def _with_instrumented_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> Step:
+    """Add a common shift that the recorded references show and the search has not found, if two joints confirm it.
 
-    Disturbances in the closed loop may hide it from prediction, not from instruments by recorded references.
+    Disturbances in the closed loop may hide it from prediction, not from the instruments.
     """
-    if any(e.q_ref is None for e in experiments):
-        near = _torque_shift(experiments, bench, best)
-        if near is None or near.samples <= LONGEST:
-            return best
     found = long_torque_shift(experiments, bench, best.h, 0.0, LONGEST_SHIFT_S)
     if found is None or not found.confirmed:
         return best

@@ -26,9 +26,6 @@ changes a torque that has 20 samples in a period by 3 %."""
 LONGEST = 1.0
 """Longest shift that is corrected without a finding, samples: longer ones are `time_shift`, a mistake of the set-up."""
 
-OWN_CAUSE = 0.2
-"""Prior share of joints whose apparent shift has a cause of its own: at most one joint in five lacks an effect."""
-
 MOST_UNCERTAIN = 0.25
 """Largest standard deviation of a shift that is corrected, samples: half a sample is then known by a factor of 2."""
 
@@ -116,17 +113,14 @@ class TorqueShift:
         """True if it certainly exceeds one sample; at least two joints confirm it, none contradicts it.
 
         Without instruments, disturbances in a damped closed loop make torques look early, up to about as many standard
-        deviations again, and a share `OWN_CAUSE` of the joints may differ. An early shift is not confirmed then.
+        deviations again. An early shift is not confirmed then.
         """
-        size, joints = abs(self.samples), self.by_joint.values()
-        apart = [(own - self.samples) / std for own, std in joints if SIGNIFICANT * std <= size]
+        size = abs(self.samples)
+        apart = [(own - self.samples) / std for own, std in self.by_joint.values() if SIGNIFICANT * std <= size]
         agree = sum(abs(one) <= SIGNIFICANT for one in apart)
-        if size <= LONGEST + SIGNIFICANT * self.std or agree < 2:
-            return False
-        if self.instrumented:
-            return agree == len(apart)
-        deny = sum(one > SIGNIFICANT or one < -2.0 * SIGNIFICANT for one in apart)
-        return self.samples > 0.0 and deny <= OWN_CAUSE * len(joints)
+        earliest = -SIGNIFICANT * (1.0 if self.instrumented else 2.0)
+        exceeds = size > LONGEST + SIGNIFICANT * self.std and (self.instrumented or self.samples > 0.0)
+        return exceeds and agree >= 2 and all(earliest <= one <= SIGNIFICANT for one in apart)
 
     @property
     def applied(self) -> bool:

@@ -15,7 +15,7 @@ from armident.configs import DataError
 from armident.identify.regression.ar_noise import ArModel, fit_ar
 from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.fit import Hypothesis
-from armident.identify.setup.result import CONVENTIONS, OWN_CAUSE, TorqueShift
+from armident.identify.setup.result import CONVENTIONS, TorqueShift
 from armident.identify.signals.experiments import Experiment
 
 Motion = tuple[Array, Array, Array]
@@ -52,6 +52,9 @@ CONVERGED = 0.1
 
 STEPS = 2001
 """Values of the shift between these limits: a two-hundredth of a sample apart."""
+
+OWN_CAUSE = 0.2
+"""Prior share of joints whose apparent shift has a cause of its own: at most one joint in five lacks an effect."""
 
 LARGE = 700.0
 """Largest logarithm of odds that is a finite number."""

@@ -210,10 +210,7 @@ def test_a_late_shift_without_references_is_denied_by_no_joint_that_disturbances
     assert late.confirmed
     assert not replace(late, instrumented=True).confirmed
     assert not replace(late, by_joint=joints | {"axis_3": (-0.8, 0.5)}).confirmed
-    later = joints | {"axis_3": (12.0, 1.6)}
-    assert not replace(late, by_joint=later).confirmed
-    # One joint in five may have a delay of its own besides.
-    assert replace(late, by_joint=later | {"axis_4": (6.0, 1.0), "axis_5": (6.9, 1.9)}).confirmed
+    assert not replace(late, by_joint=joints | {"axis_3": (12.0, 1.6)}).confirmed
     assert not replace(late, by_joint=joints | {"axis_2": (5.6, 2.4)}).confirmed
 
 
@@ -221,7 +218,7 @@ def test_a_late_shift_without_references_is_denied_by_no_joint_that_disturbances
 @pytest.mark.parametrize("samples", [6, pytest.param(0, marks=pytest.mark.nightly)])
 def test_torques_late_by_milliseconds_are_found_without_references(samples: int) -> None:
     robot = load_robot("tx40")
-    experiments = experiments_from_recording(recording("tx40", "tx40_excitation", 3, period=FAST), robot)[0]
+    experiments = experiments_from_recording(recording("tx40", "tx40_excitation", 4, period=FAST), robot)[0]
     check = check_setup([replace(moved(e, samples), q_ref=None) for e in experiments], robot)
     assert [finding.kind for finding in check.findings] == ["time_shift"] * (samples > 0)
     if check.corrected_robot is not None:
