@@ -20,6 +20,7 @@ from types import FrameType
 from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperCommand
 
 from armident.daq.logs import StderrHandler, log_to
 
@@ -81,7 +82,18 @@ def _add(app: typer.Typer, entry: importlib.metadata.EntryPoint) -> None:
         anything = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
         app.command(entry.name, help="(unavailable)", context_settings=anything)(unavailable)
     else:
-        app.command(entry.name)(_reported(function, entry.name))
+        app.command(entry.name, cls=_Command)(_reported(function, entry.name))
+
+
+class _Command(TyperCommand):
+    """A command that refuses a list of values, ``NAME,...``, that is given twice: the last would replace the first."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        given = self.make_parser(ctx).parse_args(args=list(args))[2]
+        for option in given:
+            if (option.metavar or "").endswith(",...") and given.count(option) > 1:
+                raise typer.BadParameter(f"{option.opts[0]} is given twice; give it once: {option.metavar}", ctx)
+        return super().parse_args(ctx, args)
 
 
 def _interrupted() -> typer.Exit:

@@ -26,6 +26,9 @@ RISES = tuple((rise, power) for power in (2, 4) for rise in (0.0, 0.03, 0.1, 0.3
 """Noise of differentiated encoders at the Nyquist frequency over the level at zero, and the power of its rise: twice
 the number of derivatives."""
 
+LEAST_KEPT = 0.5
+"""Least share of the power of noise that a refit leaves at a frequency of the comparison: its half has its shape."""
+
 HIGHEST = 0.7
 """Highest frequency over the Nyquist frequency: the filter of the comparison begins to fall there."""
 
@@ -77,15 +80,17 @@ class Excess:
 
 
 def spectral_excess(
-    series: Sequence[Array], velocities: Sequence[Array], dt: float, slow: float = 0.0
+    series: Sequence[Array], velocities: Sequence[Array], dt: float, slow: float = 0.0, taken: Sequence[Array] = ()
 ) -> Excess | None:
     """Band of frequencies with most power over what noise of drives and encoders has there; each series is evidence.
 
     ``series``: residuals (M,) of one joint in the band of the comparison, zero at rest. Times about reversals and under
     the velocity ``slow``, where dry friction has no model, are left out. The band is that of the series with most power
-    beyond noise: a signal need not be in every recording.
+    beyond noise: a signal need not be in every recording. ``taken``: directions (M, k), orthonormal in all series
+    together, that a fit has taken out of them.
     """
-    each = [_in_series(e, qd, dt, slow) for e, qd in zip(series, velocities, strict=True)]
+    out = taken or [np.empty((e.size, 0)) for e in series]
+    each = [_in_series(e, qd, dt, slow, own) for e, qd, own in zip(series, velocities, out, strict=True)]
     found = [one for one in each if one is not None]
     if not found:
         return None
@@ -99,12 +104,15 @@ def fisher(p_values: Iterable[float]) -> float:
     return float(chdtrc(2 * len(logarithms), -2.0 * sum(logarithms)))
 
 
-def _in_series(e: Array, qd: Array, dt: float, slow: float) -> Excess | None:
+def _in_series(e: Array, qd: Array, dt: float, slow: float, taken: Array) -> Excess | None:
     """Return the excess of one series (M,); ``None`` if it is short or at rest."""
     (away,) = away_from_reversals([e], [qd], slow)
-    power = periodogram(hann_window(e.size) * away)
+    window = hann_window(e.size)
+    power = periodogram(window * away)
+    kept = _kept(window * (away != 0.0), taken)
+    power /= np.maximum(kept, LEAST_KEPT)
     f = np.arange(power.size) / (e.size * dt)
-    used = np.flatnonzero((f > 0.0) & (f < HIGHEST * 0.5 / dt))
+    used = np.flatnonzero((f > 0.0) & (f < HIGHEST * 0.5 / dt) & (kept >= LEAST_KEPT))
     if used.size < LEAST_FREQUENCIES or not away.any():
         return None
     level = _noise_level(f, power, used, dt)
@@ -136,6 +144,12 @@ def _in_series(e: Array, qd: Array, dt: float, slow: float) -> Excess | None:
         "frequency" if narrow > MOST else "unrecorded signal", p_value, share, rms,
         (float(f[peak]),), f[around], value, noise, narrow,
     )  # fmt: skip
+
+
+def _kept(window: Array, taken: Array) -> Array:
+    """Share (F,) of the power of noise in a window (M,) that is left at each frequency without ``taken`` (M, k)."""
+    lost = np.abs(np.fft.rfft(window[:, None] * taken, axis=0)) ** 2
+    return np.asarray(1.0 - lost.sum(axis=1) / max(float(window @ window), 1e-300))
 
 
 def together(one: Excess | None, other: Excess | None) -> tuple[Excess | None, Excess | None]:

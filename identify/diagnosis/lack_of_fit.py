@@ -234,12 +234,13 @@ class LackOfFit:
             errors = [e[:, joint] for e in self.fit.errors(self.fit.theta, held=held)]
             velocities, slow = self._speeds(joint, held=held)
             away.append(away_from_reversals(errors, velocities, slow))
+            taken: list[Array] = []
             if held:
-                errors = _refitted(errors, [e.z[:, joint] for e in self.fit.equations.held])
+                errors, taken = _refitted(errors, [e.z[:, joint] for e in self.fit.equations.held])
             moments = bursts(errors, [s.t for s in stretches], velocities, slow)
             if moments is not None and moments.share >= self.criteria.burst_share:
                 found.append(moments)
-            signals.append(spectral_excess(errors, velocities, study.dt * study.decimation.factor, slow))
+            signals.append(spectral_excess(errors, velocities, study.dt * study.decimation.factor, slow, taken))
         one, other = together(*signals)
         times = [s.t for s in study.held]
         training, unseen = away
@@ -417,15 +418,16 @@ def _fall_of_error(error: Array, change: Array, away: Array) -> float:
     return fall / math.sqrt(int(np.count_nonzero(error)) or 1)
 
 
-def _refitted(errors: Sequence[Array], regressors: Sequence[Array]) -> list[Array]:
-    """Errors (M,) of a joint without what other parameters of the model explain, whose regressors are (M, b).
+def _refitted(errors: Sequence[Array], regressors: Sequence[Array]) -> tuple[list[Array], list[Array]]:
+    """Errors (M,) of a joint without what other parameters of the model explain, and the directions (M, k) of these.
 
-    Errors of the parameters give the residual of other data the spectrum of the motion.
+    Errors of the parameters give the residual of other data the spectrum of the motion. ``regressors``: (M, b).
     """
     x, e = np.concatenate(regressors), np.concatenate(errors)
-    x = x / np.maximum(np.linalg.norm(x, axis=0), 1e-300)
-    left = e - x @ np.linalg.lstsq(x, e, rcond=RANK)[0]
-    return np.split(left, np.cumsum([one.size for one in errors])[:-1])
+    taken, sizes, _ = np.linalg.svd(x / np.maximum(np.linalg.norm(x, axis=0), 1e-300), full_matrices=False)
+    taken = taken[:, sizes > RANK * sizes.max()]
+    parts = np.cumsum([one.size for one in errors])[:-1]
+    return np.split(e - taken @ (taken.T @ e), parts), np.split(taken, parts)
 
 
 def limited(residual: Array, joints: Sequence[slice], deviations: float) -> Array:

@@ -22,13 +22,10 @@ from armident.identify.setup.prior import Mistake
 from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
 from armident.identify.setup.stationarity import ChangedStretch, change_finding, spans, stretch
-from armident.identify.setup.torque_shift import common_shift, long_torque_shift
+from armident.identify.setup.torque_shift import LONGEST_SHIFT_S, common_shift, long_torque_shift
 from armident.identify.setup.weight import weight_findings
 from armident.identify.setup.zero_offset import zero_offset
 from armident.identify.signals.experiments import Experiment, check_one_rate
-
-LONGEST_SHIFT_S = 0.05
-"""Longest common shift of the torques that references are asked for, s: filters of drives are faster."""
 
 TRIED = {
     "position_sign": "wrong sign of positions, or of positions and torques, of each joint and of all",
@@ -208,7 +205,7 @@ def _searched(
 ) -> tuple[Bench, Search, Step]:
     bench = make_bench(experiments, robot, moving)
     search = Search(bench)
-    best = search.run(as_configured(robot))
+    best = search.within_limits(search.run(as_configured(robot)))
     if "time_shift" in best.families:
         best = _with_exact_shift(experiments, bench, best)
     elif moving.sum() > 1 and all(e.q_ref is not None for e in experiments):
@@ -250,7 +247,7 @@ def _with_shift(step: Step, bench: Bench, more_s: NDArray[np.floating], found: T
     mistakes = list(step.mistakes)
     mistakes[last] = replace(mistakes[last], shift=mistakes[last].shift + more_s)
     std = found.std * bench.period
-    return replace(step, mistakes=tuple(mistakes), shift_std=std, shift_measured=found.instrumented)
+    return replace(step, mistakes=tuple(mistakes), shift_std=std, shift_measured=found.instrumented or found.confirmed)
 
 
 def _clipped(

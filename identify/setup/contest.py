@@ -64,6 +64,8 @@ class Contest:
         self.wholes += beside
         self.weights = np.array([*weights, *(self._weight(search, step) for step in beside)])
         self.before, self.after = (self._explained(h) for h in (found.start, found.h))
+        # At rest, dry friction holds any load, whatever the set-up.
+        self.in_motion = [joint_errors(self.bench, h, free=True)[0] for h in (found.start, found.h)]
         self.more_plausible = log_plausibility(self.bench, found.h) - log_plausibility(self.bench, found.start)
 
     def _weight(self, search: Search, step: Step) -> float:

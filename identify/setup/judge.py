@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from armident.arrays import Array
 from armident.configs import RobotConfig
-from armident.identify.setup.calibration import CORRECTED, NAMED, probability
+from armident.identify.setup.calibration import CORRECTED, EXTREMES, NAMED, probability
 from armident.identify.setup.contest import LEAST_ERROR, Contest
 from armident.identify.setup.describe import Described, corrected_robot, described, merged_scales
 from armident.identify.setup.plausible import LEAST_ODDS
@@ -76,7 +77,7 @@ def _together(parts: Sequence[Described], good: Sequence[bool]) -> list[Describe
 def _is_likely(finding: SetupFinding, contest: Contest, robot: RobotConfig) -> bool:
     """True for a correction that a diagnosis goes on with, see `SetupCheck`."""
     joints = indices(finding.joints, robot)
-    before, after = (one.errors[contest.own(joints)] for one in (contest.before, contest.after))
+    before, after = (errors[contest.own(joints)] for errors in contest.in_motion)
     likely = finding.probability >= NAMED and explains(finding.kind, contest, joints)
     return finding.correction or (likely and (finding.kind not in WIRED or bool(np.all(before > LEAST_FALL * after))))
 
@@ -91,9 +92,12 @@ def judged_part(part: Described, contest: Contest, robot: RobotConfig) -> Descri
     if finding.kind == "time_shift" and contest.found.shift_measured:
         # A shift that the references show has the probability of its own estimate: prediction hardly tells it.
         return part
+    if finding.kind == "joint_order" and np.isfinite(gain := contest.found.order_gain):
+        odds, message = np.clip(expit(gain), *EXTREMES), f"{finding.message}: as recorded, a position passes its limit"
+        return replace(part, finding=replace(finding, probability=float(odds), message=message))
     joints = indices(finding.joints, robot)
     equal = contest.equal(finding.kind, joints)
-    share = probability(features_of(finding, contest, joints, equal))
+    share = probability(contest.features(contest.log_odds(finding.kind, joints, equal)))
     correction = share > CORRECTED and explains(finding.kind, contest, joints)
     message = finding.message
     if equal:
@@ -111,14 +115,9 @@ def explains(kind: str, contest: Contest, joints: Sequence[int]) -> bool:
     if _lost(after.errors[own], after.memory[own]).any():
         return False
     # A wrong scale of one joint shows at the others that carry the same links.
-    falls = np.any(contest.before.errors[moving] > LEAST_FALL * after.errors[moving])
+    falls = np.any(contest.in_motion[0][moving] > LEAST_FALL * contest.in_motion[1][moving])
     # A common unit shows in the limits only, a common shift in the phase.
     return bool(falls) or contest.more_plausible >= LEAST_ODDS or kind == "time_shift"
-
-
-def features_of(finding: SetupFinding, contest: Contest, joints: Sequence[int], equal: Sequence[Step]) -> Array:
-    """Features of a finding of the joints, see `calibration.FEATURES`. ``equal``: set-ups that explain as much."""
-    return contest.features(contest.log_odds(finding.kind, joints, equal))
 
 
 def _doubtful(part: Described, contest: Contest, robot: RobotConfig) -> SetupFinding:

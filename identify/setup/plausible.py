@@ -58,6 +58,12 @@ def log_plausibility(bench: Bench, h: Hypothesis) -> float:
     return signals + _beyond(rate, RATE_LEAST_HZ, math.inf)
 
 
+def passed_limits(bench: Bench, h: Hypothesis) -> NDArray[np.bool_]:
+    """Mask (n,) of the moving joints whose corrected positions pass their limits by more than rounding."""
+    logs, usable = _logs(bench, h)
+    return np.asarray(usable[0] & (logs[0] > math.log(POSITION_MOST)))
+
+
 def worst_change(bench: Bench, old: Hypothesis, new: Hypothesis) -> float:
     """Smallest change over the moving joints of the log plausibility of their own signals; negative if one gets worse.
 

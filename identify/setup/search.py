@@ -13,7 +13,14 @@ from armident.identify.setup import assignment, gravity, moves, scales
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, fit, fit_shares, held_out, joint_errors, misfit
 from armident.identify.setup.limited_least_squares import FLOOR
-from armident.identify.setup.plausible import LEAST_ODDS, equal_shares, log_plausibility, plausible_factor, worst_change
+from armident.identify.setup.plausible import (
+    LEAST_ODDS,
+    equal_shares,
+    log_plausibility,
+    passed_limits,
+    plausible_factor,
+    worst_change,
+)
 from armident.identify.setup.prior import Mistake, between, composed, cost, wiring_cost
 
 MOST_MISTAKES = 6
@@ -89,7 +96,7 @@ class Step:
 
     ``rank``: criterion, in-sample nats per row: lower is better. ``shift_std``: of a common torque shift, s; NaN if
     from the best prediction. ``shift_decisive``: prediction gains enough by it for a mistake. ``shift_measured``: by
-    undisturbed references.
+    undisturbed references, or confirmed by two joints. ``order_gain``: that of an exchange `within_limits`, nats.
     """
 
     start: Hypothesis
@@ -98,6 +105,7 @@ class Step:
     shift_std: float = np.nan
     shift_decisive: bool = True
     shift_measured: bool = False
+    order_gain: float = np.nan
 
     @cached_property
     def h(self) -> Hypothesis:
@@ -169,6 +177,21 @@ class Search:
             if clear and self._explained(best.h):
                 break
         return best
+
+    def within_limits(self, step: Step) -> Step:
+        """Return the step with an exchange that keeps the positions within their limits, if all instants prefer it.
+
+        Axes of the same size hardly differ in their torques, but no effect moves a joint past its stops.
+        """
+        if not passed_limits(self.bench, step.h).any():
+            return step
+        found = [(0.0, step)]
+        for move in moves.exchange_moves(self.bench.robot, [int(j) for j in np.flatnonzero(self.bench.moving)]):
+            other = self._made(step, move.family, move.words, move(step.h), move.drives)
+            if not passed_limits(self.bench, other.h).any() and self._material(step.h, other.h, 1.0):
+                gain = self.gain(step, other, self.bench.everywhere)[0]
+                found += [(gain, replace(other, order_gain=gain))] if gain >= LEAST_ODDS else []
+        return max(found, key=lambda one: one[0])[1]
 
     def _explained(self, h: Hypothesis) -> bool:
         """True if the model predicts every joint's torque where all move, or leaves little of it apart from noise."""

@@ -41,6 +41,9 @@ LAGS = 16
 RANGE = 5.0
 """Largest shift, samples: longer ones are mistakes of the set-up."""
 
+LONGEST_SHIFT_S = 0.05
+"""Longest of these, and of a shift with a cause of its own at one joint, s: filters of drives are faster."""
+
 ROUNDS = 12
 """Most rounds in which a longer shift is estimated again around the value of the round before."""
 
@@ -83,7 +86,7 @@ def long_torque_shift(
     for _ in range(ROUNDS):
         try:
             found = _estimated(experiments, bench, h, shift)
-            rest = _common(found, max(RANGE, reach))
+            rest = _common(found, max(RANGE, reach, LONGEST_SHIFT_S / bench.period))
             experiments = _first_part(experiments, round(MOST_SAMPLES * found.bench.segments[0].dt / bench.period))
         except (DataError, np.linalg.LinAlgError):
             return None
@@ -284,9 +287,10 @@ def _solved(
 
 def _common(found: _Shifts, reach: float) -> TorqueShift:
     """Common shift of the joints; some have effects of their own that look like a shift, such as a slow actuator."""
-    samples, std, bench = found.samples, np.sqrt(np.diag(found.covariance)), found.bench
-    if not (np.isfinite(samples).all() and np.isfinite(std).all()):
+    samples, variance, bench = found.samples, np.diag(found.covariance), found.bench
+    if not (np.isfinite(samples).all() and np.all((variance > 0.0) & np.isfinite(variance))):
         raise np.linalg.LinAlgError("the motion determines no shift of the torques")
+    std = np.sqrt(variance)
 
     def log_likelihood(shift: Array) -> Array:
         apart = (samples - shift[:, None]) / std

@@ -57,7 +57,7 @@ def measured(case: SetupCase) -> dict[str, Any]:
                     for step in (contest.found, *equal)
                 ),
                 "explains": judge.explains(finding.kind, contest, joints),
-                "x": judge.features_of(finding, contest, joints, equal).tolist(),
+                "x": contest.features(contest.log_odds(finding.kind, joints, equal)).tolist(),
             }
         )
         return made

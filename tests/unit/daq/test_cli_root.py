@@ -50,6 +50,11 @@ def changed() -> int:
     return 4
 
 
+def join(words: Annotated[str, typer.Option(metavar="WORD,...")] = "", name: str = "arm") -> None:
+    """Print the words that are given."""
+    print(words, name)
+
+
 def compile_while_interrupted() -> None:
     """Lose an interrupt in a callback, as a compiler does, and fail for that reason."""
     with suppress(KeyboardInterrupt):
@@ -64,6 +69,7 @@ ENTRIES = [
         ("refuse", "refuse"),
         ("greet", "greet"),
         ("changed", "changed"),
+        ("join", "join"),
         ("compile", "compile_while_interrupted"),
     ]
 ]
@@ -129,6 +135,14 @@ def test_a_command_chooses_its_own_exit_code() -> None:
 
 def test_options_reach_the_command() -> None:
     assert call("greet", "--name", "robot") == (0, "hello robot\n", "")
+
+
+def test_a_list_of_values_that_is_given_twice_is_refused_for_the_last_would_replace_the_first() -> None:
+    assert call("join", "--words", "a=b,c=d", "--name", "x", "--name", "y") == (0, "a=b,c=d y\n", "")
+    for repeated in (["--words=c=d"], ["--words", "a=b"]):
+        code, out, err = call("join", "--words", "a=b", *repeated)
+        assert (code, out) == (2, "")
+        assert "--words is given twice; give it once: WORD,..." in err
 
 
 @pytest.mark.parametrize("words", [["greet", "--nmae", "x"], ["no-such-command"], ["refuse"], ["--no-such-option"]])

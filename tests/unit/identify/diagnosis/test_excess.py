@@ -37,6 +37,36 @@ def test_noise_of_drives_has_no_excess(constant_s: float) -> None:
     assert min(lowest) > 1e-6
 
 
+def without_slow_parts(e: Array) -> tuple[Array, Array]:
+    """Residual without what parameters of a short part take: all below 2.5 Hz; and these directions (M, k)."""
+    t = DT * np.arange(e.size)
+    waves = [fun(np.pi * k * t / t[-1]) for k in range(1, round(2 * 2.5 * t[-1])) for fun in (np.sin, np.cos)]
+    directions, _ = np.linalg.qr(np.stack(waves, axis=1))
+    return np.asarray(e - directions @ (directions.T @ e)), np.asarray(directions)
+
+
+@pytest.mark.slow
+def test_noise_that_a_refit_has_left_is_no_signal_beside_what_it_took() -> None:
+    known: list[float] = []
+    unknown: list[float] = []
+    for seed in range(30):
+        left, taken = without_slow_parts(noise(seed, 0.03)[:300])
+        for p_values, out in ((known, [taken]), (unknown, [])):
+            found = spectral_excess([left], [SPEED[:300]], DT, taken=out)
+            assert found is not None
+            p_values.append(found.p_value)
+    # Of 30 p-values 0.3 are below 0.01; five or more have a probability of 2e-5.
+    assert np.sum(np.array(known) < 0.01) < 5 <= np.sum(np.array(unknown) < 0.01)
+
+
+def test_a_vibration_beside_a_refit_has_its_frequency() -> None:
+    left, taken = without_slow_parts((noise(1, 0.03) + 1.5 * np.sin(2 * np.pi * 8.3 * T))[:300])
+    found = spectral_excess([left], [SPEED[:300]], DT, taken=[taken])
+    assert found is not None
+    assert found.where[0] == pytest.approx(8.3, abs=0.2)
+    assert found.p_value < 1e-6
+
+
 def test_a_vibration_has_its_frequency() -> None:
     found = spectral_excess([noise(0) + 2.0 * np.sin(2 * np.pi * 3.7 * T)], [SPEED], DT)
     assert found is not None

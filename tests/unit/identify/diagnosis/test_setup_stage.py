@@ -67,3 +67,13 @@ def test_an_exchange_that_both_joints_confirm_is_corrected() -> None:
     assert [entry.effect for entry in stage.robot.effects] == ["joint_order"]
     assert finding.gap_after < 0.5 * finding.gap_before
     assert _verdict(stage.findings, []) == "explained"
+
+
+@pytest.mark.usefixtures("doubtful")
+def test_an_exchange_is_confirmed_in_motion_and_not_by_what_dry_friction_holds_at_rest() -> None:
+    order = setups.in_order(1, 0, 2)
+    recorded = setups.with_torques(setups.record(ARM, 0, pauses=True), order)
+    stage = staged(setups.with_positions(recorded, order))
+    assert [(entry.effect, entry.joint, entry.other) for entry in stage.robot.effects] == [
+        ("joint_order", "axis_1", "axis_2")
+    ]

@@ -5,12 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig, load_robot
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.setup.bench import make_bench
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.describe import as_configured
+from armident.identify.setup.result import SetupCheck
 from armident.identify.setup.search import Search, Step
 from armident.identify.setup.signals import clipped_findings, one_way_findings
 from armident.identify.signals.experiments import Experiment
@@ -432,3 +434,24 @@ def test_both_torques_of_an_exchange_have_to_be_predicted_no_worse(exchanged: bo
     first = Step(as_configured(arm))
     other = Step(replace(first.start, torque=swap))
     assert search._uncontradicted(first, other) is exchanged
+
+
+@pytest.mark.slow
+def test_an_exchange_that_torques_hardly_tell_is_told_by_a_position_past_its_limit() -> None:
+    arm, swap = setups.random_arm(0, AXES), setups.in_order(0, 2, 1)
+    noisy = setups.record(arm, 0, noise=4.0)
+    reached = np.max([np.abs(e.q).max(axis=0) for e in noisy], axis=0)
+
+    def checked_with(positions: list[Experiment], limits: NDArray[np.float64]) -> SetupCheck:
+        joints = [
+            joint.model_copy(update={"limits": joint.limits.model_copy(update={"position": (-most, most)})})
+            for joint, most in zip(arm.joints, 1.05 * limits, strict=True)
+        ]
+        return check_setup(positions, arm.model_copy(update={"joints": tuple(joints)}))
+
+    exchanged = setups.with_torques(setups.with_positions(noisy, swap), swap)
+    (finding,) = checked_with(exchanged, reached).findings
+    assert (finding.kind, finding.joints, finding.correction) == ("joint_order", ("axis_2", "axis_3"), True)
+    assert "passes its limit" in finding.message
+    for recorded, limits in ((exchanged, np.full(AXES, 9.0)), (noisy, reached), (noisy, swap @ reached)):
+        assert "joint_order" not in [f.kind for f in checked_with(recorded, limits).findings]

@@ -191,15 +191,40 @@ def test_a_long_shift_is_estimated_from_any_start(healthy: list[Experiment], arm
     assert long_torque_shift(shifted, bench, h, 0.0, 0.01) is None
 
 
-def test_a_long_shift_needs_references_and_two_joints_that_agree() -> None:
+def test_a_long_shift_needs_two_joints_that_agree_and_an_early_one_references() -> None:
     joints = {"axis_1": (4.0, 0.5), "axis_2": (4.5, 0.6), "axis_3": (-2.0, 3.0)}
     shift = TorqueShift(4.2, 0.4, 1e-3, joints, 1.0, instrumented=True)
     assert shift.confirmed
-    assert not replace(shift, instrumented=False).confirmed
+    early = replace(shift, samples=-4.2, by_joint={name: (-own, std) for name, (own, std) in joints.items()})
+    assert early.confirmed
+    assert not replace(early, instrumented=False).confirmed
     assert not replace(shift, by_joint=joints | {"axis_3": (0.0, 0.5)}).confirmed
     assert not replace(shift, by_joint=joints | {"axis_2": (4.5, 3.0)}).confirmed
     assert not replace(shift, std=1.5).confirmed
     assert not replace(shift, samples=0.8, std=0.1).confirmed
+
+
+def test_a_late_shift_without_references_is_denied_by_no_joint_that_disturbances_make_early() -> None:
+    joints = {"axis_1": (6.3, 0.5), "axis_2": (5.6, 0.7), "axis_3": (-0.8, 1.6)}
+    late = TorqueShift(6.1, 0.4, 2e-3, joints, 1.0, instrumented=False)
+    assert late.confirmed
+    assert not replace(late, instrumented=True).confirmed
+    assert not replace(late, by_joint=joints | {"axis_3": (-0.8, 0.5)}).confirmed
+    assert not replace(late, by_joint=joints | {"axis_3": (12.0, 1.6)}).confirmed
+    assert not replace(late, by_joint=joints | {"axis_2": (5.6, 2.4)}).confirmed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("samples", [6, pytest.param(0, marks=pytest.mark.nightly)])
+def test_torques_late_by_milliseconds_are_found_without_references(samples: int) -> None:
+    robot = load_robot("tx40")
+    experiments = experiments_from_recording(recording("tx40", "tx40_excitation", 4, period=FAST), robot)[0]
+    check = check_setup([replace(moved(e, samples), q_ref=None) for e in experiments], robot)
+    assert [finding.kind for finding in check.findings] == ["time_shift"] * (samples > 0)
+    if check.corrected_robot is not None:
+        delays = [effect.parameters["delay"] for effect in check.corrected_robot.effects]
+        # Disturbances in the closed loop make it look shorter.
+        assert delays == pytest.approx([samples * FAST] * robot.n, abs=2.5e-3)
 
 
 def test_aligned_torques_are_interpolated_at_the_instants_of_the_positions() -> None:
