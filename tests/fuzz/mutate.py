@@ -119,11 +119,11 @@ def spoil_json(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
     """Changes what a JSON document says, in a document that is well-formed."""
     try:
         tree = json.loads(rng.choice(seeds))
-    except ValueError:
+        for _ in range(rng.choice((1, 1, 2, 3))):
+            _spoil_node(rng, tree)
+        return json.dumps(tree).encode()
+    except ValueError:  # no JSON, or a part that was put into itself
         return spoil_text(rng, seeds)
-    for _ in range(rng.choice((1, 1, 2, 3))):
-        _spoil_node(rng, tree)
-    return json.dumps(tree).encode()
 
 
 def forge_recording(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
