@@ -122,7 +122,7 @@ def spoil_json(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
         for _ in range(rng.choice((1, 1, 2, 3))):
             _spoil_node(rng, tree)
         return json.dumps(tree).encode()
-    except ValueError:  # no JSON, or a part that was put into itself
+    except ValueError:
         return spoil_text(rng, seeds)
 
 
@@ -320,7 +320,7 @@ def _spoil_node(rng: random.Random, tree: Any) -> None:
         case 4 if isinstance(node, list):
             node.insert(key, copy.deepcopy(node[key]))
         case _:
-            node[key] = rng.choice((*VALUES, *EDGES, rng.choice(WORDS)))
+            node[key] = copy.deepcopy(rng.choice((*VALUES, *EDGES, rng.choice(WORDS))))
 
 
 def _spoil_cell(rng: random.Random, column: list[Any]) -> None:
