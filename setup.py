@@ -20,7 +20,9 @@ class BuildKernels(build_py):
         """Build the modules, then their kernels."""
         super().run()
         if not self.editable_mode:
-            environment = {**os.environ, "PYTHONPATH": str(Path(self.build_lib).absolute())}
+            # The packages of an isolated build are on the path of the environment.
+            path = [str(Path(self.build_lib).absolute()), *filter(None, [os.environ.get("PYTHONPATH")])]
+            environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
             # -P: the modules are those of the build, not those of the working directory
             subprocess.run([sys.executable, "-P", "-m", "armident.compiled"], env=environment, check=True)
 
