@@ -239,6 +239,10 @@ def read_identity(path: Path) -> Identity:
 
 def read_authority(folder: Path) -> Authority:
     """Return the authority whose key is in a folder; ConfigError if there is none."""
+    if not (folder / "authority.key").is_file():
+        raise ConfigError(
+            f"{folder / 'authority.key'}: no such file; run this where the authority of the plant is kept"
+        )
     key = read_key(folder / "authority.key")
     for certificate in read_certificates(folder / "authority.pem"):
         if isinstance(key, ec.EllipticCurvePrivateKey) and certificate.public_key() == key.public_key():

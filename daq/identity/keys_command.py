@@ -107,7 +107,7 @@ def keys(
         results += [] if session is None else of_plant.missing(path, session)
         _print_check(results, of_plant.explanations(path), as_json=as_json)
         if any(each.verdict == "failed" for each in results):
-            raise ArmidentError(f"{path}: connections would fail")
+            raise ArmidentError(f"{path}: connections fail, or will soon")
     else:
         raise ConfigError(f"no action {action!r}; expected init, enrol, show, check, renew, revoke or router")
     for each in made:
@@ -116,6 +116,8 @@ def keys(
         print(f"  copy {files} to {OF_PLANT} on its host")
     if action == "enrol":
         print(f"copy {path / ROUTER_FILE} to the host of the router, and restart the router")
+    elif any(each.name.startswith("router.") for each in made):
+        print("restart the router then: it reads its certificate at its start")
 
 
 def _show(rows: list[dict[str, Any]], *, as_json: bool) -> None:

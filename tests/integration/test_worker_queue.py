@@ -93,6 +93,8 @@ def test_what_is_passed_over_or_waits_is_said_once_with_its_reason(
         shutil.copy(os.fsencode(tmp_path / "emps-a.mcap"), os.path.join(os.fsencode(tmp_path), name))
     (tmp_path / "emps-c.mcap").write_bytes(b"no recording\x89MCAP0\r\n")
     os.mkfifo(tmp_path / "emps-d.mcap")
+    (tmp_path / "monday.mcap").touch()
+    (tmp_path / "tx40-20260105T060000-000Z.mcap").touch()
     made = recorded(session, "e")
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "emps-e.mcap").rename(tmp_path / "elsewhere" / "x.mcap")
@@ -106,9 +108,11 @@ def test_what_is_passed_over_or_waits_is_said_once_with_its_reason(
         "emps-c.mcap: not a recording (not an MCAP file); passed over",
         "emps-d.mcap: no file, but a link that leads nowhere, a folder or a pipe; it waits",
         "nnn.mcap: its name has more than 230 bytes; rename it; it waits",
+        "monday.mcap: its name does not begin with emps-; passed over",
     ):
         assert caplog.text.count(text) == 1, caplog.text
     assert caplog.text.count("its name is not UTF-8, or has control characters") == 2
+    assert "tx40" not in caplog.text  # a capture of another robot, which has a worker of its own
     assert entries(tmp_path)["emps-e"].digest == made.sha256
 
 

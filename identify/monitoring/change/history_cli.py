@@ -55,6 +55,8 @@ def _copied(word: str, files: Sequence[Path], database: str) -> int:
     if len(files) != 1:
         raise ConfigError(f"history {word}: expected one file")
     (file,) = files
+    if file.is_dir():
+        raise ConfigError(f"{file}: a folder, expected a file")
     if word == "backup":
         print(f"saved {History(database).save(file)} identifications in {file}")
         return 0

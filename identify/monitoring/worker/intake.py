@@ -2,6 +2,7 @@
 
 import logging
 import math
+import re
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -31,6 +32,9 @@ log = logging.getLogger(__name__)
 
 STILL_S = 60.0
 """Time without a change after which a file without an end counts as torn, not as one that is being copied, s."""
+
+_CAPTURE = re.compile(r"-\d{8}T\d{6}-")
+"""Time in the name of a capture: one of another robot belongs to another worker."""
 
 
 class Intake:
@@ -95,7 +99,13 @@ class Intake:
     def scan(self, ledger: Ledger, folders: Sequence[Path]) -> None:
         """Enter the finished recordings of folders that the ledger does not know; none is read."""
         for folder in folders:
-            self._say(folder, None if folder.is_dir() else "no such folder; it is searched as soon as it is there")
+            missing = not folder.is_dir()
+            self._say(folder.absolute(), "no such folder; it is searched as soon as it is there" if missing else None)
+            for path in folder.glob("*.mcap") if folder.is_dir() else ():
+                if not path.name.startswith(f"{self._robot}-") and not (
+                    _CAPTURE.search(path.name) or path in self._known
+                ):
+                    self._say(path, f"its name does not begin with {self._robot}-; passed over")
         fresh = [each for each in captured_in(folders, self._robot) if self._is_new(each)]
         if not fresh:
             return

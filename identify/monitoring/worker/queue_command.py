@@ -32,7 +32,11 @@ def queue_command(action: str, names: Sequence[str], config: Path | None, out: P
         raise ConfigError(f"{action}: name the recordings; armident queue list shows them")
     changed = ledger.change(action, names)
     if not changed:
-        raise ConfigError(f"{action}: no recording without a result is called {', '.join(names)}")
+        called = ", ".join(names)
+        raise ConfigError(
+            f"{action}: no recording without a result is called {called}; a file without an end is entered when it ends, "
+            "or has not changed for a minute"
+        )
     print(json.dumps({"changed": changed}) if as_json else "\n".join(f"{name}: {action}" for name in changed))
 
 
