@@ -34,8 +34,8 @@ def queue_command(action: str, names: Sequence[str], config: Path | None, out: P
     if not changed:
         called = ", ".join(names)
         raise ConfigError(
-            f"{action}: no recording without a result is called {called}; a file without an end is entered when it ends, "
-            "or has not changed for a minute"
+            f"{action}: no recording without a result is called {called}; a file without an end is entered when it "
+            "ends, or has not changed for a minute"
         )
     print(json.dumps({"changed": changed}) if as_json else "\n".join(f"{name}: {action}" for name in changed))
 
