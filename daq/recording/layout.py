@@ -271,10 +271,12 @@ class StreamLayout:
 
 
 def _text(value: object) -> str:
-    """Return the value if it is a string that can be encoded."""
+    """Return the value if it is a string that can be encoded, and that messages can hold."""
     if not isinstance(value, str):
         raise TypeError(f"expected a text, found {value!r:.60}")
     value.encode()
+    if len(value) > LONGEST_NAME:
+        raise ValueError(f"a name of {len(value)} characters, expected at most {LONGEST_NAME}")
     return value
 
 
@@ -284,6 +286,9 @@ def _finite(value: object) -> float:
         raise TypeError(f"expected a number, found {value!r:.60}")
     return float(value)
 
+
+LONGEST_NAME = 255
+"""Longest name of a stream, a joint or a field, characters: as that of a file."""
 
 _PYTHON_TYPES = re.compile(r"\bobject\b|literal for|could not convert|argument")
 """Texts of Python about wrong types, which help no reader of a message."""

@@ -203,7 +203,7 @@ def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str
         if block.capture != start["capture"]:
             raise DataError(f"a block of capture {block.capture or 'none'!r:.60}, not of {start['capture']}")
         if known.get(block.layout.name) != block.layout:
-            raise DataError(f"a block of stream {block.layout.name!r:.60} does not have the layout of the start event")
+            raise DataError(f"a block of stream {block.layout.name!r} does not have the layout of the start event")
     lost = total - len(by_number)
     return Recording(
         path=path,
@@ -233,7 +233,7 @@ def _stream(layout: StreamLayout, blocks: list[Block]) -> Stream:
     empty = np.empty(0, np.int64)
     sync = np.concatenate([empty, *(b.sync for b in blocks)])
     if np.any(np.diff(sync) <= 0):
-        raise DataError(f"stream {layout.name:.60}: SYNC numbers do not increase")
+        raise DataError(f"stream {layout.name}: SYNC numbers do not increase")
     raw = {
         f.name: np.concatenate([np.empty((0, len(layout.joints)), dtype), *(b.raw[f.name] for b in blocks)])
         for f, dtype in zip(layout.fields, layout.dtypes, strict=True)
