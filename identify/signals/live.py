@@ -8,7 +8,7 @@ is the only parameter, the same as in :mod:`armident.identify.signals.irwsm`: th
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from armident.arrays import Array
 from armident.compiled import compiled
@@ -32,7 +32,10 @@ class LiveDerivatives:
 
 
 class VelocityFilter:
-    """Causal filter for velocities and accelerations of n joints; no lag while the acceleration is constant."""
+    """Causal filter for velocities and accelerations of n joints; no lag while the acceleration is constant.
+
+    ``dt``: sampling period, s. ``nvr``: one or (n,), as for the smoother of third order.
+    """
 
     _saved = ("_x", "_p", "_measured")
 
@@ -67,7 +70,7 @@ class VelocityFilter:
 
 
 @compiled("f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1]", nogil=False)
-def _filter(y, nvr, driven, x, p, measured, out):  # type: ignore[no-untyped-def]
+def _filter(y: Array, nvr: Array, driven: Array, x: Array, p: Array, measured: NDArray[np.int64], out: Array) -> None:
     """Predict and update every joint at every sample; ``x`` (n, 3), ``p`` (n, 3, 3) in place."""
     half = np.empty((3, 3))
     gain = np.empty(3)
@@ -94,7 +97,7 @@ def _filter(y, nvr, driven, x, p, measured, out):  # type: ignore[no-untyped-def
 
 
 @compiled(nogil=False)
-def _predict(x, p, nvr, driven, half):  # type: ignore[no-untyped-def]
+def _predict(x: Array, p: Array, nvr: float, driven: Array, half: Array) -> None:
     """``x = F x``, ``P = F P F' + nvr driven`` for the transition of one sample."""
     x[0] += x[1] + 0.5 * x[2]
     x[1] += x[2]
@@ -111,7 +114,7 @@ def _predict(x, p, nvr, driven, half):  # type: ignore[no-untyped-def]
 
 
 @compiled(nogil=False)
-def _update(x, p, innovation, variance, gain):  # type: ignore[no-untyped-def]
+def _update(x: Array, p: Array, innovation: float, variance: float, gain: Array) -> None:
     """Measurement update in Joseph's form, which keeps the covariance symmetric and positive."""
     for a in range(3):
         gain[a] = p[a, 0] / variance
