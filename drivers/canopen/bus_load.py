@@ -34,7 +34,10 @@ DATA_BITRATES = (2_000_000, 5_000_000, 8_000_000)
 
 
 def frame_bits(data_bytes: int) -> tuple[int, int]:
-    """Minimum and maximum number of bits of a classic frame with n data bytes, interframe space included."""
+    """Minimum and maximum number of bits of a classic frame with n data bytes, interframe space included.
+
+    ``47 + 8 n`` without stuff bits, ``55 + 10 n`` with all possible ones (Davis, Burns, Bril, Lukkien 2007).
+    """
     return 47 + 8 * data_bytes, 55 + 10 * data_bytes
 
 

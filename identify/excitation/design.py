@@ -89,7 +89,8 @@ def design_trajectory(
     ``duration`` (s) is met within a millisecond. ``noise``: standard deviations (n,) of the filtered torque noise, the
     weight; by default proportional to the torque limits. ``evaluations``: number of candidates. ``margin``: usable
     share of each limit. ``theta``: standard or base parameters, so that torques stay within limits. ``aim``: effects to
-    make visible. ``shape``: trapezoidal ``moves`` or a ``fourier`` series of ``harmonics``.
+    make visible. ``shape``: trapezoidal ``moves`` or a ``fourier`` series of ``harmonics``. Raises ConfigError if no
+    move or no candidate keeps the limits.
     """
     robot.check_movable()
     model = arm_model(robot)

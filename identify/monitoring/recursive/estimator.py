@@ -68,7 +68,8 @@ class RecursiveEstimator:
 
     A random walk around an earlier identification, filtered by Young's symmetric recursive instrumental-variable
     estimator (thesis sections 3.2.2 and 7.3.3; P. C. Young, Recursive Estimation and Time-Series Analysis, 2011). Cuts
-    into blocks do not matter.
+    into blocks do not matter. Raises ConfigError for effects in the configuration, DataError for an unsuitable
+    reference or rate.
     """
 
     _saved = (
