@@ -102,7 +102,7 @@ def endless(position: object) -> object:
         return position
     if not all(isinstance(end, int | float) and not isinstance(end, bool) for end in position):
         return position
-    low, high = (float(max(-WRITTEN_NO_LIMIT, min(WRITTEN_NO_LIMIT, end))) for end in position)
+    low, high = (float(max(min(end, WRITTEN_NO_LIMIT), -WRITTEN_NO_LIMIT)) for end in position)  # NaN stays
     open_low, open_high = low <= -NO_LIMIT, high >= NO_LIMIT
     if open_low and open_high:
         return ENDLESS

@@ -289,7 +289,7 @@ class RobotConfig(WithBlanks):
         if self.transmission is not None:
             if len(self.transmission) != n or any(len(row) != n for row in self.transmission):
                 raise ValueError(f"transmission: expected {n} rows of {n} numbers (motor rows, joint columns)")
-            if abs(np.linalg.det(np.array(self.transmission))) < 1e-12:
+            if not np.linalg.slogdet(np.array(self.transmission)).logabsdet > np.log(1e-12):
                 raise ValueError("transmission: the matrix is singular")
         for coupling in self.couplings:
             for joint in coupling.joints:
