@@ -68,12 +68,12 @@ def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells"),
     raise ConfigError(f"{name}: no such file (shipped with armident: {shipped})")
 
 
-def _shipped(path: Path) -> Path | None:
-    """Return the shipped file of a relative path or bare name, ``None`` if there is none."""
+def _shipped(path: Path, folders: tuple[str, ...] = SHIPPED) -> Path | None:
+    """Return the shipped file of a relative path, or of a bare name in ``folders``; ``None`` if there is none."""
     if path.is_absolute():
         return None
     relative = Path(*path.parts[1:]) if path.parts[:1] == ("configs",) else path
-    files = [folder / relative for folder in (HERE, *(HERE / folder for folder in SHIPPED))]
+    files = [folder / relative for folder in (HERE, *(HERE / folder for folder in folders))]
     if relative.suffix in ("", ".yml"):
         files = [found for file in files for found in (file, file.with_suffix(".yaml"))]
     return next((file for file in files if is_file(file)), None)
@@ -235,26 +235,27 @@ def load_session(name: str | Path, command: str | None = None) -> SessionConfig:
             raise ConfigError(f"{path}: {error}") from error
     base = path.resolve().parent
 
-    def resolved(relative: Path, key: str) -> Path:
+    def resolved(relative: Path, key: str, folder: str) -> Path:
         target = base / relative
-        found = target if is_file(target) else _shipped(relative)
+        found = target if is_file(target) else _shipped(relative, (folder,))
         if found is None:
             raise ConfigError(f"{path}: {key}: no such file {relative} (looked for {target})")
         return found
 
     changes: dict[str, Any] = {
-        "robot": resolved(session.robot, "robot"),
+        "robot": resolved(session.robot, "robot", "robots"),
         "drives": tuple(
-            d.model_copy(update={"eds": resolved(d.eds, f"drives[{k}].eds")}) for k, d in enumerate(session.drives)
+            d.model_copy(update={"eds": resolved(d.eds, f"drives[{k}].eds", "eds")})
+            for k, d in enumerate(session.drives)
         ),
     }
     if session.setpoints is not None:
         changes["setpoints"] = session.setpoints.model_copy(
-            update={"trajectory": resolved(session.setpoints.trajectory, "setpoints.trajectory")}
+            update={"trajectory": resolved(session.setpoints.trajectory, "setpoints.trajectory", "trajectories")}
         )
     files: dict[str, Path] = {}
     if session.zenoh.config is not None:
-        files["config"] = resolved(session.zenoh.config, "zenoh.config")
+        files["config"] = resolved(session.zenoh.config, "zenoh.config", "zenoh")
     if session.zenoh.keys is not None:
         files["keys"] = base / session.zenoh.keys
     changes["zenoh"] = session.zenoh.model_copy(update=files)
