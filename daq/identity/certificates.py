@@ -115,7 +115,7 @@ def identity_of(certificate: x509.Certificate) -> tuple[Role, str, str]:
             for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATIONAL_UNIT_NAME, NameOID.ORGANIZATION_NAME)
         )
         role = next(role for role in ROLES if role == unit)
-    except (IndexError, StopIteration, ValueError) as error:
+    except (IndexError, StopIteration, TypeError, ValueError) as error:
         raise DataError("a certificate without role and cell") from error
     return role, cell, name
 
