@@ -262,15 +262,15 @@ def test_the_healthy_virtual_tx40_has_no_finding() -> None:
 
 @pytest.mark.slow
 @pytest.mark.nightly
-def test_a_coupled_wrist_with_motor_side_torques_is_corrected_by_the_configuration(
+def test_motor_side_torques_of_a_coupled_wrist_are_found_and_a_diagnosis_goes_on_corrected(
     virtual: list[Experiment], tx40: RobotConfig
 ) -> None:
     wrong = motor_torques(virtual, tx40)
     found = check_setup(wrong, tx40)
     assert [f.kind for f in found.findings] == ["side"]
-    assert "--motor-side" in found.findings[0].remedy
-    assert found.corrected_robot is not None
-    assert check_setup(wrong, found.corrected_robot).findings == ()
+    assert found.findings[0].probability > 0.9  # 0.94 to 0.95 with five seeds, at the limit of a correction to copy
+    assert found.likely_robot is not None
+    assert check_setup(wrong, found.likely_robot).findings == ()
 
 
 @pytest.mark.slow
