@@ -142,7 +142,8 @@ def _from_polled(rows: TableRows, times: Floats | None, rate_hz: float, polled: 
     index = np.flatnonzero(np.append(True, np.any(everything[1:] != everything[:-1], axis=1)))
     if index.size <= _WINDOW:
         raise DataError(f"only {index.size} of {len(everything)} rows differ from the row before: too few to resample")
-    advances = _advances(rows.values["position"][index], np.diff(index))
+    advice = "omit --polled" if polled else "leave out the rows that repeat the row before: then their times are used"
+    advances = _advances(rows.values["position"][index], np.diff(index), advice)
     # The same position with another effort is still the same sample.
     kept = np.append(True, advances > 0)
     index, ticks = index[kept], np.append(0, np.cumsum(advances))[kept]
@@ -164,7 +165,7 @@ def _from_polled(rows: TableRows, times: Floats | None, rate_hz: float, polled: 
     return Sampled(rate_hz, numbers, values, True, facts, tuple(notes))
 
 
-def _advances(q: Floats, rows: Ints) -> Ints:
+def _advances(q: Floats, rows: Ints, advice: str) -> Ints:
     """Return the samples from each row (N, n) to the next, (N - 1,); during standstill, the number of ``rows`` read."""
     from scipy.ndimage import median_filter
 
@@ -173,14 +174,11 @@ def _advances(q: Floats, rows: Ints) -> Ints:
     power = np.sum(median_steps**2, axis=1)
     moving = power > _SLOW_SHARE**2 * power.max()
     if not moving.any():
-        raise DataError("no joint moves: the sampling clock cannot be determined; omit --polled")
+        raise DataError(f"no joint moves: the sampling clock cannot be determined; {advice}")
     advance = np.sum(steps[moving] * median_steps[moving], axis=1) / power[moving]
     ambiguous = float(np.mean(np.abs(advance - np.round(advance)) > _AMBIGUOUS))
     if ambiguous > _MOST_AMBIGUOUS:
-        raise DataError(
-            f"{100 * ambiguous:.0f} % of the rows do not fit an even clock; "
-            "omit --polled if they were not polled from a controller"
-        )
+        raise DataError(f"{100 * ambiguous:.0f} % of the rows do not fit an even clock of a controller; {advice}")
     ticks = rows.astype(np.int64)
     ticks[moving] = np.maximum(0, np.round(advance)).astype(np.int64)
     return ticks
