@@ -45,6 +45,8 @@ class Criteria:
         closed loop. In that loop an effect may gain more.
     shortlist, unnamed
         Numbers of named and unnamed candidates that are tested in their own closed loop, in each step.
+    of_each_joint
+        Number of named candidates of each joint that are tested whatever those of other joints promise.
     alternatives
         Most alternatives that are listed for a finding.
     doubtful
@@ -129,6 +131,7 @@ class Criteria:
     promising: float = 0.25
     shortlist: int = 10
     unnamed: int = 4
+    of_each_joint: int = 2
     alternatives: int = 3
     doubtful: float = 0.6
     held_out_share: float = 0.35

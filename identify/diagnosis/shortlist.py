@@ -1,5 +1,6 @@
 """Shortlist of a step: the candidates whose score statistics promise the largest gains of log-likelihood."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,9 @@ from armident.identify.effects.unnamed import NAME as UNNAMED
 
 Starts = tuple[float, ...]
 """Values from which the correction of a recorded torque starts; empty for a term of the model."""
+
+Look = tuple[float, Candidate, tuple[float, Shapes], Starts]
+"""Statistic less the parameters of a candidate; the candidate; what the screening found; starting values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +50,7 @@ def shortlist(state: ModelState, incumbent: Incumbent | None, alike: set[Key]) -
     """
     criteria, column_cache = state.study.criteria, ColumnCache(state.study, state.fit.theta)
     noise = state.fit.renoised(state.weights)
-    looks: list[tuple[float, Candidate, tuple[float, Shapes], Starts]] = []
+    looks: list[Look] = []
     tests, hidden = 0, set()
     for every in candidates(column_cache):
         candidate = every
@@ -78,8 +82,8 @@ def shortlist(state: ModelState, incumbent: Incumbent | None, alike: set[Key]) -
     present = 0.0 if incumbent is None else incumbent.gain
     looks = [x for x in looks if 0.5 * x[2][0] > max(needed * (1.0 if x[3] else promising), promising * present)]
     looks.sort(key=lambda look: -look[0])
-    named = [x for x in looks if x[1].effect.name != UNNAMED][: criteria.shortlist]
-    unnamed = [x for x in looks if x[1].effect.name == UNNAMED][: criteria.unnamed]
+    named = _first([x for x in looks if x[1].effect.name != UNNAMED], criteria.shortlist, criteria.of_each_joint)
+    unnamed = _first([x for x in looks if x[1].effect.name == UNNAMED], criteria.unnamed, 1)
     chosen: list[tuple[Candidate, Shapes, Starts]] = []
     for _, own, first, starts in (*named, *unnamed):
         candidate, found = own, first
@@ -95,6 +99,18 @@ def shortlist(state: ModelState, incumbent: Incumbent | None, alike: set[Key]) -
             without = contained(noise, candidate, column_cache, ends)
             chosen.append((replace(candidate, without=without), ends, ()))
     return Shortlist(chosen, tests, frozenset(hidden))
+
+
+def _first(looks: list[Look], most: int, of_each_joint: int) -> list[Look]:
+    """Return the first ``most``, and the first of each joint: the errors of one joint do not hide those of another."""
+    count: Counter[int] = Counter()
+    found: list[Look] = []
+    for look in looks:
+        joint = look[1].place.joint
+        if len(found) < most or count[joint] < of_each_joint:
+            found.append(look)
+            count[joint] += 1
+    return found
 
 
 def _loop_improves(state: ModelState, candidate: Candidate, value: float) -> bool:
