@@ -130,6 +130,21 @@ def test_only_effects_on_a_joint_of_a_finding_compete_with_it() -> None:
     assert ("asymmetric_viscous_friction", 1) in [(one.effect.key, one.place.joint) for one, *_ in chosen.chosen]
 
 
+def test_every_joint_has_a_place_on_the_shortlist_whatever_others_promise() -> None:
+    worn = hide("asymmetric_viscous_friction", "joint_2", fva=0.2 * 5.5)
+    _, first = selection(63, worn, arm="tx40", motion="tx40_excitation")
+
+    def joints(most: int) -> list[int]:
+        criteria = replace(first.study.criteria, shortlist=most, unnamed=most, of_each_joint=1)
+        chosen = shortlist(first.of_study(replace(first.study, criteria=criteria)), None, set()).chosen
+        return [one.place.joint for one, *_ in chosen if one.effect.name != "unnamed"]
+
+    every, few = joints(1000), joints(1)
+    assert few[0] == 1
+    assert set(few) == set(every) == set(range(6))
+    assert len(few) < len(every)
+
+
 def test_a_finding_does_not_compete_again_while_its_joints_have_not_changed() -> None:
     steps, first = selection(1, SPRING)
     step = steps.step(first)
