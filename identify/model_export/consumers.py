@@ -3,7 +3,6 @@
 import subprocess
 import tempfile
 from collections.abc import Sequence
-from ctypes import POINTER
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
@@ -126,7 +125,6 @@ def _module(file: Path) -> ModuleType:
 def run_fmu(model: ExportedModel, files: Sequence[Path], motion: GivenMotion, torque: Floats) -> ProgramRun:
     """Let the unit follow a motion: find the torques of its accelerations, near ``torque`` (N, n)."""
     fmpy, fmi2 = _package("fmpy"), _package("fmpy.fmi2", "fmpy")
-    reference, real = POINTER(fmi2.fmi2ValueReference), POINTER(fmi2.fmi2Real)
     n, needed, content = model.arm.n, np.zeros_like(torque), code_of(model, "fmu").content
     # Impacts in a gear are shorter than a sample: their mean torque counts.
     parts = int(np.ceil(motion.dt / GEAR_STEP_S)) if content["gears"] else 1
@@ -143,21 +141,17 @@ def run_fmu(model: ExportedModel, files: Sequence[Path], motion: GivenMotion, to
         unit.setupExperiment(startTime=0.0)
         unit.enterInitializationMode()
         unit.exitInitializationMode()
-
         # Torques, positions, velocities and accelerations; lists of FMPy would take more time than the unit.
-        values, references = np.zeros(4 * n), np.arange(4 * n, dtype=np.uint32)
-        numbers = [
-            (references[part].ctypes.data_as(reference), size, values[part].ctypes.data_as(real))
-            for part, size in ((slice(3 * n), 3 * n), (slice(3 * n, None), n))
-        ]
+        references, numbers = (fmi2.fmi2ValueReference * (4 * n))(*range(4 * n)), (fmi2.fmi2Real * (4 * n))()
+        values = np.frombuffer(numbers)
 
         def give(state: Floats, tau: Floats) -> None:
             values[:n], values[n : 3 * n] = tau, state
-            unit.fmi2SetReal(unit.component, *numbers[0])
+            unit.fmi2SetReal(unit.component, references, 3 * n, numbers)
 
         def acceleration(state: Floats, tau: Floats) -> Floats:
             give(state, tau)
-            unit.fmi2GetReal(unit.component, *numbers[1])
+            unit.fmi2GetReal(unit.component, references, 4 * n, numbers)
             return values[3 * n :].copy()
 
         def driving(state: Floats, tau: Floats, wanted: Floats) -> Floats:

@@ -111,7 +111,8 @@ def test_an_fmu_takes_the_inertia_of_a_motor_from_its_link(name: str, tmp_path: 
     assert not any("supplement" in file.name for file in files)
     assert any("1% of the largest inertia of the joint moves from the link to the motor" in r for r in sheet.remarks)
     assert not sheet.omitted
-    assert sheet.measured is not None and sheet.measured.error_pct is not None
+    assert sheet.measured is not None
+    assert sheet.measured.error_pct is not None
     assert sheet.measured.error_pct < OF_MOTOR_PCT
 
 
