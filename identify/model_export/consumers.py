@@ -39,13 +39,14 @@ class NoProgramError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class GivenMotion:
-    """Motion of N samples: positions and derivatives (N, n), rad or m; period, s; and a title."""
+    """Motion of N samples: positions, derivatives (N, n), rad or m; period, s; title; torques that were recorded."""
 
     q: Floats
     qd: Floats
     qdd: Floats
     dt: float
     title: str
+    recorded: Floats | None = None
 
     @property
     def rows(self) -> "zip[tuple[Floats, Floats, Floats]]":
