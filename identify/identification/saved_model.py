@@ -74,17 +74,19 @@ def used_configuration(
 
 def _file(path: Path) -> Path:
     """Return the result file of a path that may be its folder."""
-    if path.suffix in (".yaml", ".yml"):
+    if path.suffix in (".yaml", ".yml", ".mcap"):
+        of_recording = path.suffix == ".mcap"
+        kind, command = ("recording", f"{path}") if of_recording else ("configuration", f"RECORDING --config {path}")
         raise ConfigError(
-            f"{path}: a configuration has no identified parameters: run `armident identify RECORDING --config {path}` "
-            "and give its identification.json"
+            f"{path}: a {kind} has no identified parameters: run `armident identify {command}` and give its "
+            "identification.json"
         )
     if not path.is_dir():
         return path
     for name in ("identification.json", "diagnosis.json"):
         if (path / name).is_file():
             return path / name
-    raise ConfigError(f"{path}: the folder has neither identification.json nor diagnosis.json")
+    raise ConfigError(f"{path}: the folder has neither identification.json nor diagnosis.json: run armident identify")
 
 
 def configuration_of(document: IdentificationDocument, path: Path) -> RobotConfig | None:

@@ -22,6 +22,7 @@ from armident.identify.model_export.formulas import FUNCTIONS, InstantModel, ins
 from armident.identify.model_export.rigid_effects import with_rigid_effects
 from armident.identify.model_export.sheet import PARTS, LimitationSheet, limitation_sheet
 from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.chain import Floats
 
 EVERY_PART = (*PARTS, "couplings", "gravity")
 """Parts of a model that code holds."""
@@ -119,9 +120,13 @@ def code_of(model: ExportedModel, format_name: str) -> Code:
         instant = replace(instant, gears={number: gear.of_bodies for number, gear in instant.gears.items()})
     if instant.gears and not (possible and _motors_have_inertia(model.arm, instant)):
         gears = ", ".join(model.effects[number].title for number in instant.gears)
-        remarks.append(f"{gears}: forward dynamics need an inertia of the motor (ia of the joint, rotor of the effect)")
-        if format_name == "fmu":
+        needed = f"{gears}: forward dynamics need an inertia of the motor (ia of the joint, rotor of the effect)"
+        if format_name == "fmu" and possible:
+            instant = _with_motors(model.arm, instant)
+            needed += f"; {LEAST_MOTOR:.0%} of the largest inertia of the joint moves from the link to the motor"
+        elif format_name == "fmu":
             instant = replace(instant, held=instant.held - set(instant.gears), gears={})
+        remarks.append(needed)
     values, chain = model.arm.values(instant.theta), model.arm.chain
     friction = zip(values.ia, values.fv, values.fc, values.off, values.smoothing, strict=True)
     couplings = [
@@ -198,11 +203,25 @@ def _safe(line: str) -> str:
     return line.replace("*/", "* /").replace("\\", "/").replace('"', "'")
 
 
-def _motors_have_inertia(arm: ArmModel, instant: InstantModel) -> bool:
-    """Return True if links that move in their gears leave `LEAST_MOTOR` of the mass matrix to the motors."""
+def _masses(arm: ArmModel, instant: InstantModel) -> tuple[Floats, Floats]:
+    """Return the mass matrices (P, n, n) of the arm and of its links alone over the workspace."""
     still = np.zeros((1, arm.n))
     theta, postures = instant.theta, arm.motion(still, still, still, dt=1.0).postures
-    mass, links = (arm.mass_matrix(each, postures) for each in (theta, np.where(arm.of_links, theta, 0.0)))
+    return arm.mass_matrix(theta, postures), arm.mass_matrix(np.where(arm.of_links, theta, 0.0), postures)
+
+
+def _with_motors(arm: ArmModel, instant: InstantModel) -> InstantModel:
+    """Return the model with `LEAST_MOTOR` of the inertia of each elastic or loose joint in its motor."""
+    mass, gears = _masses(arm, instant)[0], {}
+    for number, gear in instant.gears.items():
+        least = LEAST_MOTOR * float(mass[:, gear.joint, gear.joint].max())
+        gears[number] = gear._replace(rotor=max(gear.rotor, least))
+    return replace(instant, gears=gears)
+
+
+def _motors_have_inertia(arm: ArmModel, instant: InstantModel) -> bool:
+    """Return True if links that move in their gears leave `LEAST_MOTOR` of the mass matrix to the motors."""
+    mass, links = _masses(arm, instant)
     left = mass.copy()
     for gear in instant.gears.values():
         felt = links[:, gear.joint] - gear.rotor * np.eye(arm.n)[gear.joint]

@@ -22,7 +22,7 @@ GEAR_STEP_S = 1e-4
 """Period at which links advance in elastic or loose gears, s. Two masses then move as in steps of 2 us to 0.1 % (15 Hz)
 and 1 % (gap of 2 mm), if the motor has 5 % of the inertia; at 1 ms it is 1 % and 12 %."""
 
-OPTIONS = ("-std=c99", "-O2", "-fPIC", "-shared")
+OPTIONS = ("-std=c99", "-O3", "-fno-math-errno", "-fno-semantic-interposition", "-fPIC", "-shared")
 """Options of the compiler."""
 
 MACHINE = ("Linux", "x86_64")

@@ -65,6 +65,9 @@ def export_model(
     check_format(format_name)
     chosen = FORMATS[format_name]
     main = out / f"{model.robot.name}{chosen.suffix}" if out.is_dir() or not out.suffix else out
+    sources = [model.source, *([] if model.source_urdf is None else [model.source_urdf.file])]
+    if main.resolve() in [file.resolve() for file in sources]:
+        raise ConfigError(f"--out {main}: would overwrite what the model is read from: give another file")
     try:
         main.parent.mkdir(parents=True, exist_ok=True)
         further = (motion or motion_of(model),) if chosen.along_motion else ()

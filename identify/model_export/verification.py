@@ -74,6 +74,17 @@ def measure(model: ExportedModel, format_name: str, files: Sequence[Path], motio
     moved = identified_torque(model, motion, model.theta)[:: run.every] - expected
     physical = 100.0 * float(np.linalg.norm(moved) / max(float(np.linalg.norm(expected)), 1e-300))
     remarks = [run.remark, f"the step to a physical arm alone changes them by {physical:.2g} %"]
+    if motion.recorded is not None:
+        recorded = motion.recorded[:: run.every]
+        own, of_file = (
+            100.0 * float(np.linalg.norm(each[settled:]) / max(float(np.linalg.norm(recorded[settled:])), 1e-300))
+            for each in (expected - recorded, run.torque + added - recorded)
+        )
+        completed = "" if supplement is None else " with the supplement"
+        remarks.append(
+            f"the recorded torques differ by {own:.2g} % from those of the identified model, and by {of_file:.2g} % "
+            f"from those of the file{completed}"
+        )
     by_joint = 100.0 * errors / np.maximum(sizes, 1e-300)
     return Measured(
         run.program,
@@ -117,14 +128,15 @@ def motion_of(model: ExportedModel, file: Path | None = None) -> GivenMotion:
     experiments, _ = experiments_of([recording], model.robot, name_files=False)
     robot = model.robot
     bandwidth = robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], experiments[0].dt)
-    signals = max(smoothed_derivatives(experiments, robot, Options(), bandwidth), key=lambda each: each.q.shape[0])
+    every = zip(smoothed_derivatives(experiments, robot, Options(), bandwidth), experiments, strict=True)
+    signals, experiment = max(every, key=lambda pair: pair[0].q.shape[0])
     used = (model.document.recording, *(model.document.further_recordings or ()))
     held_out = all(reference(recording).sha256 != each.sha256 for each in used)
     title = f"{file.name} ({'held out' if held_out else 'a recording of the identification'})"
     if signals.q.shape[0] > MOST_SAMPLES:
         title = f"the first {MOST_SAMPLES} samples of {title}"
     q, qd, qdd = (x[:MOST_SAMPLES] for x in (signals.q, signals.qd, signals.qdd))
-    return GivenMotion(q, qd, qdd, experiments[0].dt, title)
+    return GivenMotion(q, qd, qdd, experiment.dt, title, experiment.tau[:MOST_SAMPLES])
 
 
 def _own_motion(model: ExportedModel) -> GivenMotion:

@@ -170,7 +170,7 @@ def test_results_that_cannot_be_written_are_one_line(folder: Path, tmp_path: Pat
 
 
 def test_a_recording_is_no_model(folder: Path) -> None:
-    with pytest.raises(DataError, match=r"one\.mcap: not a JSON document"):
+    with pytest.raises(ConfigError, match=r"no identified parameters: run `armident identify .*one\.mcap"):
         load_model(folder / "one.mcap")
 
 

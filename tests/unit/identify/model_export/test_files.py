@@ -312,6 +312,8 @@ def test_the_command_prints_one_document(
         (("--format", "urdf", "--config", "tx40"), 3, "the model is of robot 'lift_arm', the configuration of 'tx40'"),
         (("--format", "urdf", "--config", "{folder}/arm.yaml", "--urdf", "none.urdf"), 2, "none.urdf: no such file"),
         (("--format", "urdf", "--config", "{folder}/arm.yaml", "--out", "/proc/x/y.urdf"), 2, "cannot be written"),
+        (("--format", "urdf", "--config", "{folder}/arm.yaml"), 2, "lift_arm.urdf: would overwrite what the model is"),
+        (("--format", "c", "--out", "{folder}/identification.json"), 2, "would overwrite what the model is read from"),
     ],
 )
 def test_a_wrong_request_is_one_line(

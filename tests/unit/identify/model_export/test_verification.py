@@ -14,7 +14,7 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.model_export.exported_model import ExportedModel
 from armident.identify.model_export.formats import export_model
 from armident.identify.model_export.saturated_dampers import TOLERANCE, saturated_dampers
-from armident.identify.model_export.verification import identified_torque, motion_of
+from armident.identify.model_export.verification import SETTLED_S, identified_torque, motion_of
 from tests.fixtures import arms
 from tests.model_exports import exported, random_theta
 from tests.tools.export_figures import model_with
@@ -97,6 +97,15 @@ def test_a_recording_is_the_motion_and_is_said_to_be_held_out(emps: ExportedMode
     _, sheet = export_model(emps, "python", tmp_path, motion)
     assert sheet.measured is not None
     assert sheet.document()["measured"]["motion"] == motion.title
+    assert motion.recorded is not None
+    settled = slice(round(SETTLED_S / motion.dt), None)
+    wrong = (identified_torque(emps, motion) - motion.recorded)[settled]
+    found = f"{100.0 * float(np.linalg.norm(wrong) / np.linalg.norm(motion.recorded[settled])):.2g} %"
+    # The module has the torques of the model.
+    assert (
+        f"the recorded torques differ by {found} from those of the identified model, and by {found} from those of "
+        "the file"
+    ) in sheet.measured.remarks
 
 
 def test_a_missing_program_is_named(emps: ExportedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
