@@ -33,6 +33,10 @@ _SAME_SIZE = 2.0
 """Ratio of the spans of two motions in one unit: a joint that lags behind fast moves swings less, by half at most."""
 
 
+_UNSIGNED = "; it is never negative: counts with another zero or sign have to be converted where they are recorded"
+"""Hint for a torque whose sign is not known, which no option can convert."""
+
+
 def si_unit_of(quantity: str, robot: RobotConfig) -> str:
     """Return the SI unit of a quantity (``position``, ``torque``, ...) of a robot's joints, by their types."""
     kinds = {joint.type for joint in robot.joints}
@@ -70,9 +74,9 @@ def check_units(
         else:
             continue
         peaks = np.abs(joint).max(axis=0)
-        for axis, peak, limit in zip(robot.joints, peaks, limits, strict=True):
+        for axis, column, peak, limit in zip(robot.joints, joint.T, peaks, limits, strict=True):
             if not peak <= factor * limit:
-                other = position_hint if name != "torque" else ""
+                other = position_hint if name != "torque" else _UNSIGNED if column.min() >= 0 else ""
                 raise DataError(
                     f"{path}: {name} of {axis.name} reaches {peak:.4g}, its limit is {limit:.4g}: expected {hint}"
                     f"{other or _other_unit(name, axis.type, peaks / np.array(limits))}"
