@@ -113,8 +113,8 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
     _refuse_sign_bits(source, rows)
     hint = position_hint(rows.values["position"]) if source.lerobot else ""
     units = options.get("units") or {}
-    if source.lerobot and units.get("position") == "deg" and np.abs(rows.values["position"]).max() <= FULL:
-        rows = replace(rows, notes=(*rows.notes, UNSURE))
+    if source.lerobot and np.abs(rows.values["position"]).max() <= FULL:
+        rows = replace(rows, notes=(*rows.notes, *filter(None, [UNSURE.get(units.get("position", ""))])))
     rows = in_si(rows, robot, units)
     _refuse_immense(source, rows)
     side: Side = "motor" if motor_side else "joint"

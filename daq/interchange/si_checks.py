@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
+from armident.configs.schema.robot import Drive
 from armident.daq.recording import Field
 
 OMITTED = "-"
@@ -72,17 +73,23 @@ def check_units(
             limits = [j.limits.torque for j in robot.joints]
             factor, hint = _TORQUE_FACTOR, "N m (or N), joint side unless --motor-side"
         else:
-            continue
+            joint, factor, hint = values, _TORQUE_FACTOR, f"{si_unit_of(name, robot)} of the motor"
+            limits = [_strongest(j.drive) if j.drive.signal == name else np.inf for j in robot.joints]
         peaks = np.abs(joint).max(axis=0)
         for axis, column, peak, limit in zip(robot.joints, joint.T, peaks, limits, strict=True):
             if not peak <= factor * limit:
-                other = position_hint if name != "torque" else _UNSIGNED if column.min() >= 0 else ""
+                other = position_hint if name in ("position", "demand") else _UNSIGNED if column.min() >= 0 else ""
                 raise DataError(
                     f"{path}: {name} of {axis.name} reaches {peak:.4g}, its limit is {limit:.4g}: expected {hint}"
                     f"{other or _other_unit(name, axis.type, peaks / np.array(limits))}"
                 )
     if "demand" in raw:
         _check_demand(path, robot, raw["demand"][known], raw["position"][known])
+
+
+def _strongest(drive: Drive) -> float:
+    """Return the largest value of the signal of a drive; infinite if it is not configured."""
+    return drive.saturation or (3.0 * drive.rated if "rated" in drive.model_fields_set else np.inf)
 
 
 def _other_unit(name: str, kind: str, shares: NDArray[np.float64]) -> str:
@@ -92,6 +99,7 @@ def _other_unit(name: str, kind: str, shares: NDArray[np.float64]) -> str:
     """
     option, factor, others = {
         ("torque", "revolute"): ("torque=mnm", 1e-3, "shares of the rated torque"),
+        ("current", kind): ("current=ma", 1e-3, "shares of the rated current"),
         ("position", "revolute"): ("position=deg", np.pi / 180.0, "shares of a range"),
         ("position", "prismatic"): ("position=mm", 1e-3, "shares of a range"),
     }.get((name, kind), ("", 1.0, ""))
