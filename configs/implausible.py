@@ -23,11 +23,8 @@ FASTEST_DEGREES = 1000.0
 QUICKEST_S = 0.005
 """Shortest time, s, to the velocity limit: the quickest arms take seven times as long."""
 
-HEAVIEST, LIGHTEST = 2000.0, 0.5
-"""Masses over the cube of the reach, kg/m^3, beyond which they are in another unit: arms have 5 to 300."""
-
-FARTHEST = 10.0
-"""Largest distance of a centre of mass from its joint over the reach."""
+HEAVIEST = 2000.0
+"""Mass over the cube of the reach, kg/m^3, that is rather in g: arms have 5 to 300."""
 
 LARGEST_BITS = 34
 """Resolution that is likelier to be a number of bits than of counts per turn; 32 bits are the finest encoders."""
@@ -55,7 +52,10 @@ def implausible_values(robot: RobotConfig) -> Iterator[str]:
             f"gravity: {list(robot.gravity)} has a size of {size:.4g} m/s^2; on Earth this direction is {meant}, and "
             "[0, 0, 0] is for torques without gravity"
         )
-    yield from _masses(robot)
+    reach = sum(math.hypot(joint.mdh.d, joint.mdh.r) for joint in robot.joints)
+    mass = sum(robot.first_moments.get(f"m{k}", 0.0) for k in range(1, robot.n + 1))
+    if reach and mass > HEAVIEST * reach**3:
+        yield f"urdf: masses of {mass:.4g} kg in all for a reach of {reach:.3g} m; if they are in g, {mass / 1000:.4g} kg"
     for k, (joint, row) in enumerate(zip(robot.joints, robot.transmission_matrix, strict=True)):
         ratio = max(map(abs, row.tolist()))
         if joint.type == "revolute" and ratio < LEAST_RATIO:
@@ -70,19 +70,6 @@ def implausible_values(robot: RobotConfig) -> Iterator[str]:
             yield f"joints[{k}].limits.acceleration: {most:g} reaches {fastest:g} in {1e3 * fastest / most:.2g} ms{degrees}"
         yield from _resolution(joint, f"joints[{k}].drive.counts_per_unit")
         yield from _drive(joint, f"joints[{k}].drive", ratio)
-
-
-def _masses(robot: RobotConfig) -> Iterator[str]:
-    """Yield the sum of the masses of the URDF, or the farthest of their centres, that no arm of its reach has."""
-    reach = sum(math.hypot(joint.mdh.d, joint.mdh.r) for joint in robot.joints)
-    if not (reach and robot.first_moments):
-        return
-    bodies = [[robot.first_moments[f"{name}{k}"] for name in ("m", "mx", "my", "mz")] for k in range(1, robot.n + 1)]
-    total, farthest = sum(mass for mass, *_ in bodies), max(math.hypot(*first) / mass for mass, *first in bodies)
-    if not LIGHTEST <= total / reach**3 <= HEAVIEST:
-        yield f"urdf: masses of {total:.4g} kg in all for a reach of {reach:.3g} m: are they in kg (not g)?"
-    if farthest > FARTHEST * reach:
-        yield f"urdf: a centre of mass is {farthest:.3g} m from its joint, the reach is {reach:.3g} m: are they in m?"
 
 
 def _velocity(joint: Joint, place: str, ratio: float) -> Iterator[str]:

@@ -23,7 +23,7 @@ _LONGEST_LINE = 4096
 """Lines of text logs have some hundred characters; longer ones are no lines of a log."""
 
 
-_BY_SUFFIX: Mapping[str, type[LineParser]] = {".log": CandumpLines, ".asc": AscLines, ".trc": TrcLines}
+_BY_SUFFIX: Mapping[str, type[LineParser]] = {".asc": AscLines, ".trc": TrcLines}
 _PARSERS: tuple[type[LineParser], ...] = (CsvLines, BusmasterLines, CandumpLines, AscLines, TrcLines)
 
 
@@ -57,8 +57,7 @@ def read_log(path: Path) -> LogFrames:
         if suffix == ".blf":
             read_blf(path, frames)
             return frames.finish(path, added_up=False)
-        usual = _BY_SUFFIX.get(suffix, CandumpLines)
-        parser = (usual if suffix in (".asc", ".trc") else _parser_of(path) or usual)()
+        parser = (_BY_SUFFIX.get(suffix) or _parser_of(path) or CandumpLines)()
         _read_lines(path, parser, frames)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or 'an error of the file system'}") from error

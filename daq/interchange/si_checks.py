@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
-from armident.configs.schema.robot import Drive
 from armident.daq.recording import Field
 
 OMITTED = "-"
@@ -74,7 +73,7 @@ def check_units(
             factor, hint = _TORQUE_FACTOR, "N m (or N), joint side unless --motor-side"
         else:
             joint, factor, hint = values, _TORQUE_FACTOR, f"{si_unit_of(name, robot)} of the motor"
-            limits = [_strongest(j.drive) if j.drive.signal == name else np.inf for j in robot.joints]
+            limits = [(j.drive.signal == name and j.drive.saturation) or np.inf for j in robot.joints]
         peaks = np.abs(joint).max(axis=0)
         for axis, column, peak, limit in zip(robot.joints, joint.T, peaks, limits, strict=True):
             if not peak <= factor * limit:
@@ -85,11 +84,6 @@ def check_units(
                 )
     if "demand" in raw:
         _check_demand(path, robot, raw["demand"][known], raw["position"][known])
-
-
-def _strongest(drive: Drive) -> float:
-    """Return the largest value of the signal of a drive; infinite if it is not configured."""
-    return drive.saturation or (3.0 * drive.rated if "rated" in drive.model_fields_set else np.inf)
 
 
 def _other_unit(name: str, kind: str, shares: NDArray[np.float64]) -> str:

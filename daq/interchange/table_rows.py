@@ -116,23 +116,19 @@ def _in_order(rows: TableRows) -> TableRows:
     if rows.times is None:
         return rows
     notes: tuple[str, ...] = ()
-    newest_first, order = descending(rows.times), np.argsort(rows.times)
-    sortable = rows.times.size > 2 and _even(rows.times[order])
-    if newest_first and not (sortable and np.any(np.diff(rows.times) > 0)):
-        rows = rows.taken(np.arange(rows.times.size)[::-1])
+    steps, order = np.diff(rows.times), np.argsort(rows.times)
+    # The times of two runs are not even where they overlap.
+    sorted_steps = np.diff(rows.times[order])
+    even = 2.0 * np.abs(sorted_steps - np.median(sorted_steps)) < np.median(sorted_steps)
+    if descending(rows.times) and not (even.all() and np.any(steps > 0)):
+        rows = rows.taken(np.arange(order.size)[::-1])
         notes = ("the newest row comes first: read from the last row to the first",)
-    elif sortable and np.any(np.diff(rows.times) < 0):
+    elif even.all() and np.any(steps < 0):
         rows = rows.taken(order)
         notes = ("the rows are out of order, and their times are even: sorted by time",)
     assert rows.times is not None
     times, wrapped = without_wraps(rows.times)
     return replace(rows, times=times, notes=(*rows.notes, *notes, *wrapped))
-
-
-def _even(times: Floats) -> bool:
-    """Return True for times of one clock, (N,) in their order: those of two runs are not even where they overlap."""
-    steps = np.diff(times)
-    return bool(steps.min() > 0.5 * np.median(steps) and steps.max() < 1.5 * np.median(steps))
 
 
 def _found(
