@@ -55,7 +55,7 @@ def implausible_values(robot: RobotConfig) -> Iterator[str]:
     reach = sum(math.hypot(joint.mdh.d, joint.mdh.r) for joint in robot.joints)
     mass = sum(robot.first_moments.get(f"m{k}", 0.0) for k in range(1, robot.n + 1))
     if reach and mass > HEAVIEST * reach**3:
-        yield f"urdf: masses of {mass:.4g} kg in all for a reach of {reach:.3g} m; if they are in g, {mass / 1000:.4g} kg"
+        yield f"urdf: masses of {mass:.4g} kg for a reach of {reach:.3g} m; if they are in g, {mass / 1000:.4g} kg"
     for k, (joint, row) in enumerate(zip(robot.joints, robot.transmission_matrix, strict=True)):
         ratio = max(map(abs, row.tolist()))
         if joint.type == "revolute" and ratio < LEAST_RATIO:
@@ -66,8 +66,8 @@ def implausible_values(robot: RobotConfig) -> Iterator[str]:
         yield from _velocity(joint, f"joints[{k}].limits.velocity", ratio)
         most, fastest = joint.limits.acceleration, min(joint.limits.velocity, FASTEST[joint.type])
         if fastest / QUICKEST_S < most < math.inf:
-            degrees = f"; as degrees/s^2 it is {math.radians(most):.4g} rad/s^2" if joint.type == "revolute" else ""
-            yield f"joints[{k}].limits.acceleration: {most:g} reaches {fastest:g} in {1e3 * fastest / most:.2g} ms{degrees}"
+            as_degrees = f"; as degrees/s^2 it is {math.radians(most):.4g} rad/s^2" * (joint.type == "revolute")
+            yield f"joints[{k}].limits.acceleration: {most:g} reaches {fastest:g} in {fastest / most:.2g} s{as_degrees}"
         yield from _resolution(joint, f"joints[{k}].drive.counts_per_unit")
         yield from _drive(joint, f"joints[{k}].drive", ratio)
 

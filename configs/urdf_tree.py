@@ -83,7 +83,8 @@ def moving_links(file: Path, base: str | None) -> list[list[tuple[str, str, str]
     """Name of each moving joint, and the links before and after it, from the base to each end of a branch."""
     tree = read_tree(file)
     ends: list[list[tuple[str, str, str]]] = []
-    todo = [(tree.root() if base is None else tree.known(base, "urdf.base"), ends[:0])]
+    root = tree.root() if base is None else tree.known(base, "urdf.base")
+    todo: list[tuple[str, list[tuple[str, str, str]]]] = [(root, [])]
     for link, path in todo:
         ways = [element for element in tree.below.get(link, []) if tree.moves(element)]
         ends += [] if ways else [path]

@@ -202,11 +202,8 @@ def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0, *, rec
 def _jittering(times: Floats, rate_hz: float | None, repeated: float, received: bool, how: str) -> Clock:
     """Return the clock of even samples at a stated rate whose times jitter; refuse anything else."""
     steps = np.diff(times)
-    sizes = np.unique(np.round(steps, 9))
-    # Even samples whose times have few digits are two neighbouring numbers of their last digit apart.
-    two = sizes.size == 2 and abs(sizes[0] / np.ptp(sizes) - round(sizes[0] / np.ptp(sizes))) < EVEN
-    coarse = two or float(np.mean(steps == 0)) > EQUAL
-    # The times at which they change tell the rate.
+    coarse = float(np.mean(steps == 0)) > EQUAL
+    # Of times with few digits, those at which they change tell the rate.
     ends = np.flatnonzero(steps > 0)[[0, -1]] + 1 if coarse and np.sum(steps > 0) > 1 else np.array([0, steps.size])
     mean = float(np.diff(ends)[0] / np.diff(times[ends])[0])
     low, high = np.quantile(steps, [0.01, 0.99])

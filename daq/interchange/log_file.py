@@ -121,8 +121,8 @@ def _check_lines(
         number, line = malformed[0]
         hint = {
             "candump": "; `candump -l` or `candump -L` writes the format that is read",
-            "CSV": "; times are in s, or in the unit of their name, 'time [us]'; data have two hexadecimal digits for each "
-            "byte, or are decimal as the identifiers of a column 'ID (dec)'",
+            "CSV": "; times are in s or the unit of their name, 'time [us]'; data have two hexadecimal digits for each "
+            "byte, or are decimal beside a column 'ID (dec)'",
         }.get(parser.name, "")
         raise DataError(f"{path}: not a {parser.name} log: line {number} is {excerpt(line)}{hint}")
     if bad or untimed:
