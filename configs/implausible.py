@@ -20,6 +20,12 @@ FASTEST = {"revolute": 50.0, "prismatic": 20.0}
 FASTEST_DEGREES = 1000.0
 """Velocity limit of a revolute joint above which 1/min of a motor is likelier than degrees/s."""
 
+QUICKEST_S = 0.005
+"""Shortest time, s, to the velocity limit: the quickest arms take seven times as long."""
+
+HEAVIEST = 2000.0
+"""Mass over the cube of the reach, kg/m^3, that is rather in g: arms have 5 to 300."""
+
 LARGEST_BITS = 34
 """Resolution that is likelier to be a number of bits than of counts per turn; 32 bits are the finest encoders."""
 
@@ -46,6 +52,10 @@ def implausible_values(robot: RobotConfig) -> Iterator[str]:
             f"gravity: {list(robot.gravity)} has a size of {size:.4g} m/s^2; on Earth this direction is {meant}, and "
             "[0, 0, 0] is for torques without gravity"
         )
+    reach = sum(math.hypot(joint.mdh.d, joint.mdh.r) for joint in robot.joints)
+    mass = sum(robot.first_moments.get(f"m{k}", 0.0) for k in range(1, robot.n + 1))
+    if reach and mass > HEAVIEST * reach**3:
+        yield f"urdf: masses of {mass:.4g} kg for a reach of {reach:.3g} m; if they are in g, {mass / 1000:.4g} kg"
     for k, (joint, row) in enumerate(zip(robot.joints, robot.transmission_matrix, strict=True)):
         ratio = max(map(abs, row.tolist()))
         if joint.type == "revolute" and ratio < LEAST_RATIO:
@@ -54,6 +64,10 @@ def implausible_values(robot: RobotConfig) -> Iterator[str]:
                 f"of {1 / ratio:.6g} to 1 has {1 / ratio:.6g}"
             )
         yield from _velocity(joint, f"joints[{k}].limits.velocity", ratio)
+        most, fastest = joint.limits.acceleration, min(joint.limits.velocity, FASTEST[joint.type])
+        if fastest / QUICKEST_S < most < math.inf:
+            as_degrees = f"; as degrees/s^2 it is {math.radians(most):.4g} rad/s^2" * (joint.type == "revolute")
+            yield f"joints[{k}].limits.acceleration: {most:g} reaches {fastest:g} in {fastest / most:.2g} s{as_degrees}"
         yield from _resolution(joint, f"joints[{k}].drive.counts_per_unit")
         yield from _drive(joint, f"joints[{k}].drive", ratio)
 
@@ -92,6 +106,8 @@ def _drive(joint: Joint, place: str, ratio: float) -> Iterator[str]:
         letter = drive.signal[0].replace("c", "A").replace("v", "V")
         yield f"{place}.rated: {drive.rated:g} {letter}; as m{letter} it is {drive.rated / 1000:g} {letter}"
         return
+    if "rated" in drive.model_fields_set and not 1.0 <= (drive.saturation or drive.rated) / drive.rated <= RATED_FACTOR:
+        yield f"{place}.saturation: {drive.saturation:g}, of a drive that is rated {drive.rated:g} (both A, V or N m)"
     if drive.gain == 0.0:
         yield f"{place}.gain: 0: every torque would be 0; give the torque per unit of the signal"
     elif {"gain", "rated"} <= drive.model_fields_set and limit < math.inf:

@@ -21,7 +21,7 @@ QUARTER_TOLERANCE = 1e-4
 """Largest relative distance of a position limit from whole quarter turns that is rounding of the written value."""
 
 STRONGEST_GRAVITY = 100.0
-"""Largest acceleration of gravity, m/s^2: four times that of Jupiter; larger ones are mm/s^2."""
+"""Largest acceleration of gravity, m/s^2: four times that of Jupiter; larger ones are cm/s^2 or mm/s^2."""
 
 LONGEST_AXIS = 200.0
 """Largest position limit of a linear axis, m: longer than the longest rails; larger ones are millimetres."""
@@ -30,9 +30,10 @@ LONGEST_AXIS = 200.0
 def suspected_units(robot: RobotConfig, geometry: bool = True) -> list[str]:
     """Key, value and suspected unit of values that look like degrees or mm; ``geometry``: MDH parameters, too."""
     found: list[str] = []
-    if math.hypot(*robot.gravity) > STRONGEST_GRAVITY:
-        metres = ", ".join(f"{g / 1000:g}" for g in robot.gravity)
-        found.append(f"gravity: {list(robot.gravity)} looks like mm/s^2 (in m/s^2: [{metres}])")
+    if (size := math.hypot(*robot.gravity)) > STRONGEST_GRAVITY:
+        unit, factor = ("cm", 100) if size < 100 * STRONGEST_GRAVITY / 4 else ("mm", 1000)
+        metres = ", ".join(f"{g / factor:g}" for g in robot.gravity)
+        found.append(f"gravity: {list(robot.gravity)} looks like {unit}/s^2 (in m/s^2: [{metres}])")
     for k, joint in enumerate(robot.joints):
         place = f"joints[{k}]"
         found += [

@@ -79,15 +79,19 @@ def serial_tips(file: Path, base: str | None = None) -> dict[str, tuple[str, ...
     return found
 
 
-def moving_links(file: Path, base: str | None, tip: str) -> list[tuple[str, str]]:
-    """Links before and after each moving joint, base to tip; raises ConfigError if the base does not move the tip."""
+def moving_links(file: Path, base: str | None) -> list[list[tuple[str, str, str]]]:
+    """Name of each moving joint, and the links before and after it, from the base to each end of a branch."""
     tree = read_tree(file)
-    path = tree.path_to(tree.root() if base is None else base, tree.known(tip, "urdf.tip"))
-    return [
-        (end_link(element, "parent"), end_link(element, "child"))
-        for element in path
-        if tree.type_of(element) != "fixed"
-    ]
+    ends: list[list[tuple[str, str, str]]] = []
+    root = tree.root() if base is None else tree.known(base, "urdf.base")
+    todo: list[tuple[str, list[tuple[str, str, str]]]] = [(root, [])]
+    for link, path in todo:
+        ways = [element for element in tree.below.get(link, []) if tree.moves(element)]
+        ends += [] if ways else [path]
+        for element in ways:
+            joint = (str(element.get("name")), link, end_link(element, "child"))
+            todo.append((joint[2], path if tree.type_of(element) == "fixed" else [*path, joint]))
+    return ends
 
 
 def orientation(file: Path, link: str) -> Array:

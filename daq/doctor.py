@@ -40,6 +40,8 @@ from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
 from armident.drivers.can.timestamps import has_hardware_timestamps
 from armident.drivers.canopen.bus_load import check_fits
 from armident.drivers.canopen.eds import read_eds
+from armident.drivers.canopen.objects import TPDO_COMMUNICATION
+from armident.drivers.canopen.pdo_mapping import TIMERS
 from armident.drivers.vcan.interfaces import have_socketcan
 
 Verdict = Literal["ok", "warning", "failed"]
@@ -130,8 +132,16 @@ def _data_sheets(session: SessionConfig) -> Iterator[Check]:
         except ConfigError as error:
             yield Check("eds", "failed", str(error))
             continue
-        if sheet.remarks:
-            yield Check("eds", "warning", f"{file}: {'; '.join(sheet.remarks)}")
+        fixed = [
+            f"TPDO{stream.tpdo} keeps its {name} of {timer.default * unit_ms:g} ms, which is read-only: {effect}"
+            for stream in session.streams.values()
+            for sub, (name, unit_ms, effect) in TIMERS.items()
+            if (timer := sheet.objects.get_variable(TPDO_COMMUNICATION + stream.tpdo - 1, sub)) is not None
+            and timer.default
+            and not timer.writable
+        ]
+        if sheet.remarks or fixed:
+            yield Check("eds", "warning", f"{file}: {'; '.join([*sheet.remarks, *fixed])}")
         else:
             yield Check("eds", "ok", f"{file.name}: {len(sheet.objects)} objects")
 

@@ -4,6 +4,7 @@ import os.path
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -69,14 +70,21 @@ def from_urdf(
         # The reader of the chain names the reason.
         return _of_chain(file, out, base, None)
     chains = [(base, one) for one in tips]
-    fitting = chains if fits is None else [chain for chain in chains if _is_fit(_of_chain(file, out, *chain), fits)]
+    fitting = chains if fits is None else [chain for chain in chains if _is_fit(file, out, chain, fits)]
     if fits is not None and not fitting:
-        fitting = _longest_parts(file, out, base, list(tips), fits)
+        fitting = _longest_parts(file, out, base, fits)
     if len(fitting) == 1:
+        if fits is not None:
+            _refuse_recorded_load(file, out, *fitting[0], fits)
         return _chosen(file, out, *fitting[0])
-    if len(chains) == 1:
+    # Numbered columns fit any part of a chain, names those of several arms on one link.
+    if len(chains) == 1 and len({begin for begin, _ in fitting}) != 1:
         return _chosen(file, out, *chains[0])
-    listed = "; ".join(f"--tip {one} ({', '.join(joints)})" for one, joints in tips.items())
+    listed = "; ".join(
+        f"{f'--base {begin} ' if begin else ''}--tip {end} ({', '.join(joint.name for joint in joints)})"
+        for begin, end in fitting or chains
+        if (joints := _of_chain(file, out, begin, end).robot.joints)
+    )
     why = "and the recording fits none of them" if not fitting else "of which one is identified"
     raise ConfigError(f"{file}: has several chains, {why}: {listed}")
 
@@ -91,26 +99,38 @@ def _chosen(file: Path, out: Path, base: str | None, tip: str) -> Geometry:
     return whole if whole is not None and whole.content["joints"] == part.content["joints"] else part
 
 
+def _refuse_recorded_load(
+    file: Path, out: Path, base: str | None, tip: str, fits: Callable[[RobotConfig], object]
+) -> None:
+    """Refuse a chain whose load has two recorded joints in series: they are its arm behind a branch, not fingers."""
+    held = set(held_joints(file, base, tip))
+    for path in moving_links(file, base):
+        for (one, begin, _), (other, _, end) in pairwise(path):
+            if {one, other} <= held and _is_fit(file, out, (begin, end), fits):
+                # The reader of their chain names the branch.
+                _of_chain(file, out, base, end)
+
+
 def _longest_parts(
-    file: Path, out: Path, base: str | None, tips: list[str], fits: Callable[[RobotConfig], object]
+    file: Path, out: Path, base: str | None, fits: Callable[[RobotConfig], object]
 ) -> list[tuple[str | None, str]]:
     """Ends of the longest parts of chains whose joints are the recorded ones; several if that does not decide."""
-    links = [moving_links(file, base, tip) for tip in tips]
-    for length in range(max(map(len, links)) - 1, 0, -1):
+    links = moving_links(file, base)
+    for length in range(max(map(len, links)), 0, -1):
         parts = {
-            (chain[first][0], chain[first + length - 1][1])
+            (chain[first][1], chain[first + length - 1][2])
             for chain in links
             for first in range(len(chain) - length + 1)
         }
-        found = sorted(part for part in parts if _is_fit(_of_chain(file, out, *part), fits))
+        found = sorted(part for part in parts if _is_fit(file, out, part, fits))
         if found:
             return list(found)
     return []
 
 
-def _is_fit(geometry: Geometry, fits: Callable[[RobotConfig], object]) -> bool:
+def _is_fit(file: Path, out: Path, chain: tuple[str | None, str], fits: Callable[[RobotConfig], object]) -> bool:
     try:
-        fits(geometry.robot)
+        fits(_of_chain(file, out, *chain).robot)
     except ArmidentError:
         return False
     return True

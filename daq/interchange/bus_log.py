@@ -43,9 +43,11 @@ def recording_from_log(
     for bus, frames_of_it, mask in zip(session.all_buses, read, masks, strict=True):
         if not np.any(frames_of_it["can_id"] == COB_SYNC):
             where = f" of {bus.channel}" if len(read) > 1 else ""
+            found_128 = np.any(frames_of_it["can_id"] == int(str(COB_SYNC), 16))
+            decimal = "; 128 is SYNC in decimal: name the column 'ID (dec)'" if found_128 else ""
             raise DataError(
                 f"{path}: no SYNC ({COB_SYNC:X}h) among its {frames_of_it.size} frames{where}: "
-                "samples cannot be matched"
+                f"samples cannot be matched{decimal}"
             )
         clock += continuous(path, frames_of_it, log.lines[mask], session)
         clock += check_sync_period(path, frames_of_it, session, rate_hz)
@@ -66,7 +68,8 @@ def recording_from_log(
         silent = _silent(read, streams, robot)
         raise DataError(f"{path}: no SYNC was answered by all drives; the session expects TPDOs {wanted}{silent}")
     phase = None if assembler.has_counter else unknown_phase(session)
-    stepped = clock_steps(found["samples"].sync, found["samples"].t_ns, session)
+    rows = found["samples"]
+    stepped = clock_steps(rows.sync, rows.t_ns, session, counted=assembler.has_counter)
     notes = (*log.notes, *chosen, *dict.fromkeys(clock), *wrong, *stepped, *([phase] if phase else []))
     for note in notes:
         logging.getLogger(__name__).warning("%s: %s", path, note)

@@ -202,7 +202,10 @@ def clock_of(times: Floats, rate_hz: float | None, repeated: float = 0.0, *, rec
 def _jittering(times: Floats, rate_hz: float | None, repeated: float, received: bool, how: str) -> Clock:
     """Return the clock of even samples at a stated rate whose times jitter; refuse anything else."""
     steps = np.diff(times)
-    mean = steps.size / float(times[-1] - times[0])
+    coarse = float(np.mean(steps == 0)) > EQUAL
+    # Of times with few digits, those at which they change tell the rate.
+    ends = np.flatnonzero(steps > 0)[[0, -1]] + 1 if coarse and np.sum(steps > 0) > 1 else np.array([0, steps.size])
+    mean = float(np.diff(ends)[0] / np.diff(times[ends])[0])
     low, high = np.quantile(steps, [0.01, 0.99])
     spread = f"steps of {low:.4g} to {high:.4g} s, {mean:.6g} Hz on average ({how})"
     if repeated > POLLED_SHARE:
@@ -210,7 +213,7 @@ def _jittering(times: Floats, rate_hz: float | None, repeated: float, received: 
             f"the times jitter: {spread}, and {100 * repeated:.1f} % of the rows repeat the row before: the samples "
             "were polled; --resample RATE, with the rate of the controller, puts them on its clock"
         )
-    if rate_hz is None and float(np.mean(steps == 0)) > EQUAL:
+    if rate_hz is None and coarse:
         raise JitterError(
             f"the times have too few digits: {spread}; --rate {two_digits(mean):g} if the samples are even, "
             "or write the times with more digits"
@@ -322,8 +325,11 @@ def continuous(path: Path, frames: Frames, lines: Ints, session: SessionConfig) 
     return [f"times begin again after {wraps[0] * 1e-9:.10g} s ({len(wraps)} times): unwrapped"]
 
 
-def clock_steps(numbers: Ints, t_ns: Ints, session: SessionConfig) -> list[str]:
-    """Return a sentence if the times of SYNCs, ns, (N,), step where their numbers, (N,), do not."""
+def clock_steps(numbers: Ints, t_ns: Ints, session: SessionConfig, *, counted: bool) -> list[str]:
+    """Return a sentence if the times of SYNCs, ns, (N,), step where their numbers, (N,), do not.
+
+    ``counted``: the numbers are those of a SYNC counter.
+    """
     period = session.sync.period_us * 1000
     late = np.diff(t_ns) - np.diff(numbers) * period
     limit = max(_CLOCK_STEP_NS, (session.sync.counter or 0) * period * 0.9)
@@ -332,8 +338,9 @@ def clock_steps(numbers: Ints, t_ns: Ints, session: SessionConfig) -> list[str]:
         return []
     k = int(steps[0])
     more = f" (and at {steps.size - 1} more)" if steps.size > 1 else ""
-    turns = ", or whole turns of the counter are missing there" if session.sync.counter and late[k] > 0 else ""
-    runs = ", or another run begins there: write one file for each" if not session.sync.counter and late[k] < 0 else ""
+    turns = ", or whole turns of the counter are missing there" if counted and late[k] > 0 else ""
+    goes_on = counted and numbers[k + 1] - numbers[k] == 1
+    runs = "" if goes_on else ", or another run begins there: write one file for each"
     return [
         f"times step by {late[k] * 1e-9:+.4g} s at SYNC {numbers[k + 1]}{more}, where the SYNCs go on: "
         f"the clock was set{turns}{runs}"

@@ -99,6 +99,7 @@ def cells_of(line: str, delimiter: str | None) -> list[str]:
 
 def seconds_of_date(text: str) -> float | None:
     """Return the seconds since 1970 of a date with time of day (ISO 8601; UTC if it has no zone), or ``None``."""
+    text = text.removesuffix(" UTC")
     if len(text) < 10 or text[4:5] != "-":
         return None
     # Python reads six digits of a second; the others are added.
@@ -173,7 +174,7 @@ def _with_header(head: _Head, before: Sequence[tuple[int, str, bool]], *, ends_e
         # A header that does not fit the values is named by the caller.
         fits = [cells_of(before[-1][1], head.delimiter)]
     fits = [cells[: head.columns] if not any(cells[head.columns :]) else cells for cells in fits]
-    units = [c for c in fits if all(not cell or _UNIT.match(cell) or plain_unit(cell) in SCALES for cell in c)]
+    units = [c for c in fits if 2 * sum(map(_is_unit, c)) > sum(map(bool, c))]
     named = [cells for cells in fits if cells not in units]
     if len(named) > 1 and _repeats(named[-1]) and not _repeats(named[-2]):
         # Names of columns differ, units below them do not.
@@ -186,6 +187,10 @@ def _with_header(head: _Head, before: Sequence[tuple[int, str, bool]], *, ends_e
         elif fits:
             head.header = fits[-1]
     return head
+
+
+def _is_unit(cell: str) -> bool:
+    return bool(_UNIT.match(cell)) or plain_unit(cell) in SCALES
 
 
 def _repeats(cells: Sequence[str]) -> bool:

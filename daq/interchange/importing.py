@@ -14,6 +14,7 @@ from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.daq.interchange.bag_files import bag_files
 from armident.daq.interchange.clocks import UNITS, descending, gaps_and_counters
 from armident.daq.interchange.column_units import SINCE
+from armident.daq.interchange.exporting import CLOCK_SET_NS
 from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.lerobot import FULL, UNSURE, data_files, position_hint
 from armident.daq.interchange.readers import check_options, reader_of
@@ -113,8 +114,8 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
     _refuse_sign_bits(source, rows)
     hint = position_hint(rows.values["position"]) if source.lerobot else ""
     units = options.get("units") or {}
-    if source.lerobot and units.get("position") == "deg" and np.abs(rows.values["position"]).max() <= FULL:
-        rows = replace(rows, notes=(*rows.notes, UNSURE))
+    if source.lerobot and np.abs(rows.values["position"]).max() <= FULL:
+        rows = replace(rows, notes=(*rows.notes, *filter(None, [UNSURE.get(units.get("position", ""))])))
     rows = in_si(rows, robot, units)
     _refuse_immense(source, rows)
     side: Side = "motor" if motor_side else "joint"
@@ -153,7 +154,7 @@ def _from_table(robot: RobotConfig, source: Source, options: ImportOptions, fact
     for note in notes:
         logging.getLogger(__name__).warning("%s: %s", path, note)
     remarks = {NOTES: "; ".join(notes)} if notes else {}
-    begin_ns = _begin_ns(source, rows)
+    begin_ns = _begin_ns(source, rows, options.get("time_unit"))
     recording = _recording(robot, fields, made, known, {**facts, **made.facts, **remarks}, begin_ns)
     if resample_hz is None or abs(made.rate_hz / resample_hz - 1.0) < 1e-9:
         return recording
@@ -219,18 +220,19 @@ def _check_rates(rate_hz: float | None, polled: bool, resample_hz: float | None)
         raise ConfigError(f"--rate {rate_hz:g} and --resample {resample_hz:g} contradict each other; give one of them")
 
 
-def _begin_ns(source: Source, rows: TableRows) -> int:
-    """Return the time of the first row, ns UTC: of a stamp, or from the date in the unit of the times; else 0."""
+def _begin_ns(source: Source, rows: TableRows, stated: str | None) -> int:
+    """Return the time of the first row, ns UTC: of a stamp, from the date in the unit, or since 1970; else 0."""
     if source.t_ns is not None:
         return max(int(source.t_ns[rows.row[0]]), 0)
-    date = source.units.get(rows.time_name, "").partition(SINCE)[2]
-    try:
-        start = int(np.datetime64(date.removesuffix("Z"), "ns").astype(np.int64)) if date else 0
-    except ValueError:
-        start = 0
-    if not 0 < start < 2**62 or rows.times is None:
+    if rows.times is None:
         return 0
-    return start + round(float(rows.times[0]) * UNITS.get(rows.time_unit, 1.0) * 1e9)
+    date = source.units.get(rows.time_name, "").partition(SINCE)[2]
+    begin_ns = round(float(rows.times[0]) * UNITS.get(stated or rows.time_unit, 1.0) * 1e9)
+    try:
+        begin_ns += int(np.datetime64(date.removesuffix("Z"), "ns").astype(np.int64)) if date else 0
+    except ValueError:
+        return 0
+    return begin_ns if CLOCK_SET_NS <= begin_ns < 2**62 else 0
 
 
 def _recording(

@@ -14,24 +14,29 @@ from armident.daq.interchange.bag_files import METADATA, SUFFIXES
 from armident.daq.interchange.text_files import listed
 
 STATE, ACTION, EPISODE = "observation.state", "action", "episode_index"
-_EFFORTS = {
-    "tau": ("effort", "efforts", "torque", "torques", "joint_effort", "joint_torque"),
-    "current": ("current", "currents", "joint_current", "motor_current"),
+_QUANTITIES = {
+    "effort": ("effort", "efforts", "eff", "torque", "torques", "tau"),
+    "current": ("current", "currents"),
+    "velocity": ("velocity", "vel"),
 }
-"""Last words of the columns of observations that are an effort."""
+"""Last words of the columns of observations, and of the names in a state, that tell another quantity than position."""
 FULL = 100.0
 """Ends of a calibrated range in the default unit of positions; those of a gripper are 0 and 100."""
-UNSURE = (
-    "degrees are right only if the arm was recorded with use_degrees: no position passes 100, and LeRobot's default is "
-    "-100 to 100 of the calibrated range"
-)
-"""Note on positions that are stated to be in degrees."""
+UNSURE = {
+    "deg": "degrees are right only if the arm was recorded with use_degrees: no position passes 100, and LeRobot's "
+    "default is -100 to 100 of the calibrated range",
+    "": "positions are taken as rad; LeRobot's default is -100 to 100 of the calibrated range (--units "
+    "position=FILE.json), or degrees",
+}
+"""Notes on positions of a data set by the unit that is stated, or none."""
 _COUNTS = 4096
 """Counts per turn of the servos of LeRobot's arms (STS3215, XL330, XL430)."""
 _MOST = 1 << 31
 """Counts that no range reaches."""
 _BETWEEN = 6
 """Periods from an episode to the next: a gap at every rate. Many short episodes do not count as lost samples."""
+MOST_DEGREES = 720.0
+"""Positions beyond two turns are counts."""
 _SUFFIX = re.compile(r"[._](pos|position|goal|eff|effort|torque|tau|current)$", re.IGNORECASE)
 """End of a name that tells the quantity, not the joint."""
 
@@ -66,26 +71,36 @@ def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDAr
     features = _features(path)
     table: dict[str, NDArray[np.float64]] = {}
     notes: list[str] = []
-    efforts = {
-        base: next((name for name in arrays if name.startswith("observation.") and name.split(".")[-1] in words), None)
-        for base, words in _EFFORTS.items()
-    }
     if STATE not in arrays:
         raise DataError(f"{path}: this data set has no {STATE}, the measured positions; found {listed(list(arrays))}")
-    if not any(efforts.values()):
+    sources = {"position": STATE, "demand": ACTION} | {
+        kind: name
+        for name in reversed(list(arrays))
+        if name.startswith("observation.") and (kind := _quantity(name)) != "position"
+    }
+    found = {
+        quantity: (source, _matrix(path, source, arrays[source]), _names(features, source))
+        for quantity, source in sources.items()
+        if source in arrays
+    }
+    kinds = [_quantity(name) for name in _names(features, STATE)]
+    _, state, state_names = found["position"]
+    if len(kinds) == state.shape[1]:
+        for kind in dict.fromkeys(kinds):
+            own = [k for k, each in enumerate(kinds) if each == kind]
+            found[kind] = STATE, state[:, own], [state_names[k] for k in own]
+        state_names = found.get("position", found[kinds[0]])[2]
+    found.pop("velocity", None)
+    if not found.keys() & {"effort", "current"}:
         raise DataError(
             f"{path}: this data set has no effort or current of its joints, which a model is identified from; "
             f"expected observation.effort or observation.current, found {listed(list(arrays))}"
         )
-    sources = {"position": STATE, "demand": ACTION, "effort": efforts["tau"], "current": efforts["current"]}
     bases = {"position": "q", "demand": "qr", "effort": "tau", "current": "current"}
-    state_names = _names(features, STATE)
+    state_names = [_SUFFIX.sub("", each) for each in state_names]
     unnamed: list[str] = []
-    for quantity, source in sources.items():
-        if source is None or source not in arrays:
-            continue
-        values = _matrix(path, source, arrays[source])
-        names = _names(features, source)
+    for quantity, (source, values, full) in found.items():
+        names = [_SUFFIX.sub("", each) for each in full]
         if not names and len(state_names) == values.shape[1]:
             names = state_names
             notes.append(f"{source} has no names of joints: taken in the order of {STATE}")
@@ -108,8 +123,16 @@ def lerobot_table(path: Path, arrays: Mapping[str, Any]) -> tuple[dict[str, NDAr
     return table, notes
 
 
+def _quantity(name: str) -> str:
+    """Return the quantity of a column of observations, or of a name in a state, by its last word."""
+    last = re.split(r"[._]", name.lower())[-1]
+    return next((quantity for quantity, words in _QUANTITIES.items() if last in words), "position")
+
+
 def position_hint(position: NDArray[np.float64]) -> str:
     """Return the units that positions (N, n) of a data set may have, and the options that read them, for a message."""
+    if np.abs(position).max() > MOST_DEGREES:
+        return "; counts of the servos have to be converted where they are recorded"
     if np.abs(position).max() > FULL:
         return "; values beyond 100 are degrees (use_degrees) in a data set of LeRobot: --units position=deg reads them"
     return (
@@ -177,11 +200,11 @@ def _features(path: Path) -> Mapping[str, Any]:
 
 
 def _names(features: Mapping[str, Any], column: str) -> list[str]:
-    """Return the names of the joints of a column, without the word for the quantity; empty if there are none."""
+    """Return the names of the joints of a column; empty if there are none."""
     entry = features.get(column)
     names = entry.get("names") if isinstance(entry, dict) else None
     if isinstance(names, dict):
         names = next((each for each in names.values() if isinstance(each, list)), None)
     if not isinstance(names, list) or not all(isinstance(each, str) for each in names):
         return []
-    return [_SUFFIX.sub("", each) for each in names]
+    return names

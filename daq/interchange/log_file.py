@@ -23,7 +23,7 @@ _LONGEST_LINE = 4096
 """Lines of text logs have some hundred characters; longer ones are no lines of a log."""
 
 
-_BY_SUFFIX: Mapping[str, type[LineParser]] = {".log": CandumpLines, ".asc": AscLines, ".trc": TrcLines}
+_BY_SUFFIX: Mapping[str, type[LineParser]] = {".asc": AscLines, ".trc": TrcLines}
 _PARSERS: tuple[type[LineParser], ...] = (CsvLines, BusmasterLines, CandumpLines, AscLines, TrcLines)
 
 
@@ -36,12 +36,13 @@ def is_text_log(path: Path) -> bool:
 
 
 def _parser_of(path: Path) -> type[LineParser] | None:
-    """Return the parser that finds a frame in the first lines of a file."""
+    """Return the parser that finds a frame, or a heading of its own, in the first lines of a file."""
     with path.open(encoding=encoding_of(path), errors="replace", newline="\n") as file:
         lines = [file.readline(_LONGEST_LINE).strip() for _ in range(_HEAD)]
     for each in _PARSERS:
         parser = each()
-        if any(isinstance(kind := parser.parse(line), tuple) or kind is LineKind.WITHOUT_TIME for line in lines):
+        kinds = [parser.parse(line) for line in lines]
+        if any(isinstance(kind, tuple) or kind in (LineKind.WITHOUT_TIME, LineKind.HEADING) for kind in kinds):
             return each
     return None
 
@@ -56,8 +57,7 @@ def read_log(path: Path) -> LogFrames:
         if suffix == ".blf":
             read_blf(path, frames)
             return frames.finish(path, added_up=False)
-        usual = _BY_SUFFIX.get(suffix, CandumpLines)
-        parser = (usual if suffix in (".asc", ".trc") else _parser_of(path) or usual)()
+        parser = (_BY_SUFFIX.get(suffix) or _parser_of(path) or CandumpLines)()
         _read_lines(path, parser, frames)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or 'an error of the file system'}") from error
@@ -119,7 +119,11 @@ def _check_lines(
         )
     if bad > frames.count + frames.foreign:
         number, line = malformed[0]
-        hint = "; `candump -l` or `candump -L` writes the format that is read" if parser.name == "candump" else ""
+        hint = {
+            "candump": "; `candump -l` or `candump -L` writes the format that is read",
+            "CSV": "; times are in s or the unit of their name, 'time [us]'; data have two hexadecimal digits for each "
+            "byte, or are decimal beside a column 'ID (dec)'",
+        }.get(parser.name, "")
         raise DataError(f"{path}: not a {parser.name} log: line {number} is {excerpt(line)}{hint}")
     if bad or untimed:
         frames.skipped += bad + untimed

@@ -15,6 +15,7 @@ class LineKind(Enum):
     """Kind of a line without a classic data frame with an 11-bit identifier."""
 
     COMMENT = "comment, heading or event"
+    HEADING = "a heading that only this format has"
     FOREIGN = "another frame"
     MALFORMED = "not a line of this format"
     WITHOUT_TIME = "a frame without a time"

@@ -24,9 +24,13 @@ _NAMES = {
 _BYTE = re.compile(r"(?:d|b|byte|data|databyte)(\d{1,2})")
 _UNIT = re.compile(r"[\[(]\s*([^\])]*)[\])]|_(ms|us|ns|s)$", re.IGNORECASE)
 _HEX = re.compile(r"(?:0x)?([0-9a-f]{1,8})h?", re.IGNORECASE)
+_WORD = re.compile(r"[^\W_]+")
+_OF_DAY = re.compile(r"'?(\d{1,2}):(\d\d):(\d\d)(?:[.,](\d+))?")
 _YES = frozenset({"1", "true", "yes", "y", "x", "ext"})
 _EXPONENTS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 """Powers of ten from a unit of times to ns."""
+_SINCE_1970 = {12: "ms", 15: "us", 18: "ns"}
+"""Unit of times since 1970 by the power of ten of their first digit, where no name states it."""
 _LARGEST = 20
 """Power of ten above which a number is no time."""
 
@@ -34,8 +38,9 @@ _LARGEST = 20
 class CsvLines:
     """Lines of a bus log in CSV, with columns for time, identifier and data in any order.
 
-    Times are in the unit of their name; else whole numbers are us if every byte has a column (SavvyCAN), and others s.
-    Data are hexadecimal, but Base64 beside a column ``arbitration_id`` (python-can).
+    Times are in the unit of their name; else whole numbers are us if every byte has a column (SavvyCAN), those since
+    1970 in the unit of their size, and others s. Identifier and data are hexadecimal, or decimal where the name of the
+    first says so (``ID (dec)``); data are Base64 beside a column ``arbitration_id`` (python-can).
     """
 
     name = "CSV"
@@ -48,10 +53,13 @@ class CsvLines:
         self._bytes: list[int] = []
         self._unit = ""
         self._base64 = False
+        self._base = 16
 
     def parse(self, line: str) -> FrameLine | LineKind:
         """Return the frame of a line, or the kind of the line. ``line``: without spaces at its ends."""
-        if not line or self._is_heading(line) or not self._columns:
+        if self._is_heading(line):
+            return LineKind.HEADING
+        if not line or not self._columns:
             return LineKind.COMMENT
         cells = cells_of(line, self._delimiter)
         if max(self._columns.values()) >= len(cells):
@@ -63,7 +71,9 @@ class CsvLines:
         length = own.get("length")
         if t_ns is None or found is None or not (length is None or length.isdecimal()):
             return LineKind.MALFORMED
-        can_id, count = int(found[1], 16), None if length is None else int(length[:3])
+        if self._base == 10 and not found[1].isdecimal():
+            return LineKind.MALFORMED
+        can_id, count = int(found[1], self._base), None if length is None else int(length[:3])
         if can_id > 0x7FF or (count or 0) > MOST_BYTES:
             return LineKind.FOREIGN
         data = self._data(own.get("data", ""), [cells[k] for k in self._bytes if k < len(cells)], count)
@@ -91,27 +101,32 @@ class CsvLines:
         self._delimiter, self._columns, self._bytes = delimiter, columns, [k for _, k in numbered]
         self._unit = time_unit(unit[1] or unit[2]) if unit else ""
         self._base64 = plain[columns["id"]] == "arbitrationid"
+        self._base = 10 if re.search(r"\bdec", cells[columns["id"]], re.IGNORECASE) else 16
         return True
 
     def _time_ns(self, text: str) -> int | None:
         try:
             number = Decimal(text.replace(",", "."))
         except InvalidOperation:
+            if found := _OF_DAY.fullmatch(text):
+                return nanoseconds(str((int(found[1]) * 60 + int(found[2])) * 60 + int(found[3])), found[4])
             seconds = seconds_of_date(text)
             return None if seconds is None else int(seconds * 1e9)
         if not number.is_finite() or number.adjusted() > _LARGEST:
             return None
-        unit = self._unit or ("us" if self._bytes and text.lstrip("-").isdecimal() else "s")
+        whole_us = self._bytes and text.lstrip("-").isdecimal()
+        unit = self._unit or ("us" if whole_us else _SINCE_1970.get(number.adjusted(), "s"))
         t_ns = int(number.scaleb(_EXPONENTS.get(unit, 9)))
         return t_ns if abs(t_ns) < LATEST_NS else None
 
     def _data(self, text: str, cells: list[str], count: int | None) -> bytes | None:
-        if self._bytes:
-            return octets_of(cells, sum(map(bool, cells)) if count is None else count)
         try:
-            if self._base64:
+            if self._base64 and not self._bytes:
                 return b64decode(text, validate=True)
-            return bytes.fromhex("".join(word.removeprefix("0x") for word in text.split()))
+            words = [word.removeprefix("0x") for word in (filter(None, cells) if self._bytes else _WORD.findall(text))]
+            if len(words) > 1 or self._base == 10 or self._bytes:
+                return octets_of(words, len(words) if count is None else count, self._base)
+            return bytes.fromhex("".join(words))
         except ValueError:
             return None
 
@@ -138,7 +153,7 @@ class BusmasterLines:
         """Return the frame of a line, or the kind of the line. ``line``: without spaces at its ends."""
         if not line or line.startswith("***"):
             self._heading(line)
-            return LineKind.COMMENT
+            return LineKind.HEADING if line.startswith("***BUSMASTER") else LineKind.COMMENT
         found = _EVENT.match(line)
         if found is None:
             return LineKind.MALFORMED
@@ -150,7 +165,7 @@ class BusmasterLines:
         if kind.lower() != "s":
             return LineKind.FOREIGN
         try:
-            can_id = int(identifier, self._base)
+            can_id = int(identifier.removesuffix("h"), self._base)
         except ValueError:
             return LineKind.MALFORMED
         data = octets_of(rest.split(), min(MOST_BYTES, int(length[:3])), self._base)

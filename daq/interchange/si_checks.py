@@ -33,6 +33,10 @@ _SAME_SIZE = 2.0
 """Ratio of the spans of two motions in one unit: a joint that lags behind fast moves swings less, by half at most."""
 
 
+_UNSIGNED = "; it is never negative: counts with another zero or sign have to be converted where they are recorded"
+"""Hint for a torque whose sign is not known, which no option can convert."""
+
+
 def si_unit_of(quantity: str, robot: RobotConfig) -> str:
     """Return the SI unit of a quantity (``position``, ``torque``, ...) of a robot's joints, by their types."""
     kinds = {joint.type for joint in robot.joints}
@@ -68,11 +72,12 @@ def check_units(
             limits = [j.limits.torque for j in robot.joints]
             factor, hint = _TORQUE_FACTOR, "N m (or N), joint side unless --motor-side"
         else:
-            continue
+            joint, factor, hint = values, _TORQUE_FACTOR, f"{si_unit_of(name, robot)} of the motor"
+            limits = [(j.drive.signal == name and j.drive.saturation) or np.inf for j in robot.joints]
         peaks = np.abs(joint).max(axis=0)
-        for axis, peak, limit in zip(robot.joints, peaks, limits, strict=True):
+        for axis, column, peak, limit in zip(robot.joints, joint.T, peaks, limits, strict=True):
             if not peak <= factor * limit:
-                other = position_hint if name != "torque" else ""
+                other = position_hint if name in ("position", "demand") else _UNSIGNED if column.min() >= 0 else ""
                 raise DataError(
                     f"{path}: {name} of {axis.name} reaches {peak:.4g}, its limit is {limit:.4g}: expected {hint}"
                     f"{other or _other_unit(name, axis.type, peaks / np.array(limits))}"
@@ -88,6 +93,7 @@ def _other_unit(name: str, kind: str, shares: NDArray[np.float64]) -> str:
     """
     option, factor, others = {
         ("torque", "revolute"): ("torque=mnm", 1e-3, "shares of the rated torque"),
+        ("current", kind): ("current=ma", 1e-3, "shares of the rated current"),
         ("position", "revolute"): ("position=deg", np.pi / 180.0, "shares of a range"),
         ("position", "prismatic"): ("position=mm", 1e-3, "shares of a range"),
     }.get((name, kind), ("", 1.0, ""))

@@ -129,13 +129,14 @@ def _converted(source: Source, units: list[str]) -> Source:
 
 
 def _numeric(arrays: Mapping[str, Any]) -> Table:
-    """Return the real arrays; vectors as (N,), and dates and durations as seconds since the first."""
+    """Return the real arrays; vectors as (N,), dates as seconds since 1970, and durations since the first."""
     table: Table = {}
     for name, value in arrays.items():
         if not isinstance(value, np.ndarray) or not value.size:
             continue
         if value.dtype.kind in "mM":
-            table[name] = (value - value.min()) / np.timedelta64(1, "ns") * 1e-9
+            origin = np.datetime64(0, "ns") if value.dtype.kind == "M" else value.min()
+            table[name] = (value - origin) / np.timedelta64(1, "ns") * 1e-9
         elif value.dtype.kind in "iuf":
             array = value.astype(np.float64)
             table[name] = array.ravel() if array.ndim == 2 and 1 in array.shape else array

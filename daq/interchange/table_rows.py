@@ -116,9 +116,16 @@ def _in_order(rows: TableRows) -> TableRows:
     if rows.times is None:
         return rows
     notes: tuple[str, ...] = ()
-    if descending(rows.times):
-        rows = rows.taken(np.arange(rows.times.size)[::-1])
+    steps, order = np.diff(rows.times), np.argsort(rows.times)
+    # The times of two runs are not even where they overlap.
+    sorted_steps = np.diff(rows.times[order])
+    even = 2.0 * np.abs(sorted_steps - np.median(sorted_steps)) < np.median(sorted_steps)
+    if descending(rows.times) and not (even.all() and np.any(steps > 0)):
+        rows = rows.taken(np.arange(order.size)[::-1])
         notes = ("the newest row comes first: read from the last row to the first",)
+    elif even.all() and np.any(steps < 0):
+        rows = rows.taken(order)
+        notes = ("the rows are out of order, and their times are even: sorted by time",)
     assert rows.times is not None
     times, wrapped = without_wraps(rows.times)
     return replace(rows, times=times, notes=(*rows.notes, *notes, *wrapped))
@@ -194,8 +201,10 @@ def _single(rows: TableRows) -> TableRows:
         return rows
     everything = np.concatenate(list(rows.values.values()), axis=1)
     equal = (everything[1:] == everything[:-1]) | (np.isnan(everything[1:]) & np.isnan(everything[:-1]))
-    twice = np.append(False, (np.diff(rows.times) == 0) & equal.all(axis=1))
-    if not twice.any():
+    same = np.diff(rows.times) == 0
+    twice = np.append(False, same & equal.all(axis=1))
+    # Of times with few digits, most rows of one time differ, and equal ones are a standstill.
+    if not twice.any() or 2 * twice.sum() < same.sum():
         return rows
     note = f"{int(twice.sum())} duplicate rows with the same time: one of each is kept"
     return replace(rows.taken(~twice), notes=(*rows.notes, note))

@@ -6,8 +6,8 @@ import numpy as np
 
 from armident.arrays import Array
 
-BITS = (7, 10, 15)
-"""Bits that are signs: of one byte, of the load of Feetech and Dynamixel servos (10), of two bytes."""
+BITS = range(7, 16)
+"""Bits that may be signs: 7 of one byte, 10 of the load of Feetech and Dynamixel servos, 15 of two bytes."""
 
 WIDTHS = (8, 16, 32)
 """Bits of unsigned numbers that hold negative ones at their upper end."""
@@ -16,7 +16,7 @@ LEAST_ROWS = 50
 """Least number of negative values, and of others."""
 
 SMOOTHER = 0.5
-"""Most total variation of the decoded signal over that of the recorded one, which jumps wherever the sign changes."""
+"""Largest steps of the decoded signal over those of the recorded one where the sign changes, on average."""
 
 FINEST = 1e-7
 """Smallest difference over the largest value: files have about nine digits."""
@@ -39,8 +39,7 @@ def sign_bit(x: Array) -> SignBit | None:
     if x.min() < 0 or step is None:
         return None
     counts = x / step
-    jumps = float(np.abs(np.diff(counts)).sum())
-    best: tuple[float, SignBit | None] = SMOOTHER, None
+    best: tuple[float, SignBit | None] = np.inf, None
     ways = [(2.0**bit, 2.0 ** (bit + 1), f"bit {bit} is the sign") for bit in BITS]
     ways += [(2.0**w / 2, 2.0**w, f"negative numbers of {w} bits are written as unsigned ones") for w in WIDTHS]
     for k, (base, top, how) in enumerate(ways):
@@ -49,11 +48,12 @@ def sign_bit(x: Array) -> SignBit | None:
             continue
         in_bit = k < len(BITS)
         decoded = np.where(negative, base - counts if in_bit else counts - top, counts)
-        left = float(np.abs(np.diff(decoded)).sum()) / jumps
-        if left < best[0]:
+        left, changes = np.abs(np.diff(decoded)), np.diff(negative)
+        smooth = left[changes].sum() < SMOOTHER * np.abs(np.diff(counts))[changes].sum()
+        if smooth and left.sum() < best[0]:
             least, end = f"{base * step:.10g}", f"{top * step:.10g}"
             formula = f"x if x < {least} else " + (f"{least} - x" if in_bit else f"x - {end}")
-            best = left, SignBit(base * step, how, formula)
+            best = float(left.sum()), SignBit(base * step, how, formula)
     return best[1]
 
 

@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shutil
 import socket
 import time
 from pathlib import Path
@@ -21,6 +23,7 @@ from armident.systemd import Notifier
 from tests.integration.test_capture_vcan import session_file
 
 SYSTEMD = HERE / "systemd"
+EDS = HERE / "eds" / "cia402_servo.eds"
 
 
 def cell(folder: Path, **changes: Any) -> Path:
@@ -203,6 +206,9 @@ def implausible(folder: Path, place: str, value: Any, name: str = "tx40") -> lis
         ("joints.1.drive.rated", 2500.0, "joints[1].drive.rated: 2500 A; as mA it is 2.5 A"),
         ("joints.1.drive.gain", 400.0, "give joint_2 a rated torque of 3.2e+04, its limit is 110"),
         ("joints.1.drive.gain", 0.0, "every torque would be 0"),
+        ("joints.0.limits.acceleration", 5730.0, "as degrees/s^2 it is 100 rad/s^2"),
+        ("joints.1.drive.saturation", 6000.0, "joints[1].drive.saturation: 6000, of a drive that is rated"),
+        ("joints.1.drive.saturation", 0.5, "joints[1].drive.saturation: 0.5, of a drive that is rated"),
     ],
 )
 def test_values_that_no_arm_has_are_warnings(tmp_path: Path, place: str, value: Any, said: str) -> None:
@@ -222,6 +228,32 @@ def test_values_that_no_arm_has_are_warnings(tmp_path: Path, place: str, value: 
 def test_values_that_no_linear_axis_has_are_warnings(tmp_path: Path, place: str, value: float, said: list[str]) -> None:
     messages = implausible(tmp_path, place, value, "emps")
     assert [message[: len(text)] for message, text in zip(messages, said, strict=True)] == said
+
+
+def test_masses_in_grams_are_a_warning(tmp_path: Path) -> None:
+    urdf = (HERE / "examples/integration_test/picker.urdf").read_text()
+    (tmp_path / "picker.urdf").write_text(re.sub(r'mass value="([\d.]+)"', r'mass value="\g<1>e3"', urdf))
+    shutil.copy(HERE / "examples/integration_test/picker.yaml", tmp_path)
+    found = [check.message for check in checks_for(tmp_path / "picker.yaml", "identify") if check.name == "robot"]
+    assert found == ["urdf: masses of 1.52e+04 kg for a reach of 0.42 m; if they are in g, 15.2 kg"]
+
+
+@pytest.mark.parametrize(("gravity", "said"), [(-981.0, "cm/s^2"), (-9810.0, "mm/s^2")])
+def test_gravity_in_another_unit_fails_with_its_size(tmp_path: Path, gravity: float, said: str) -> None:
+    data = yaml.safe_load((HERE / "robots" / "tx40.yaml").read_text())
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump({**data, "gravity": [0.0, 0.0, gravity]}))
+    check = checks_for(tmp_path / "robot.yaml", "identify")[0]
+    assert check.verdict == "failed"
+    assert f"looks like {said} (in m/s^2: [0, 0, -9.81])" in check.message
+
+
+def test_an_inhibit_time_that_a_drive_keeps_is_a_warning(tmp_path: Path) -> None:
+    head, sheet, rest = re.split(r"(?s)(\[1800sub3\].*?)(?=\[1800sub5\])", EDS.read_text(), maxsplit=1)
+    sheet = sheet.replace("AccessType=rw", "AccessType=ro").replace("DefaultValue=0", "DefaultValue=10")
+    path = with_sheet(tmp_path, f"{head}{sheet}{rest}".encode())
+    second = [check for check in run_checks(path) if check.name == "eds"][1]
+    assert second.verdict == "warning"
+    assert "TPDO1 keeps its inhibit time of 1 ms, which is read-only" in second.message
 
 
 def test_positions_in_degrees_fail(tmp_path: Path) -> None:

@@ -207,7 +207,7 @@ def test_impossible_rows_are_gaps_of_the_recording_and_are_interpolated(tx40: Ro
     assert [(gap.first, gap.reason) for gap in again.gaps] == [(1000, REASON), (2500, REASON)]
 
 
-@pytest.mark.parametrize("bit", [7, 10, 15])
+@pytest.mark.parametrize("bit", [7, 9, 10, 11, 14, 15])
 def test_a_sign_in_a_bit_is_refused_with_the_way_to_decode_it(tx40: RobotConfig, bit: int) -> None:
     t, q, tau = motion(np.random.default_rng(bit), 500.0)
     size = np.rint(0.8 * (1 << bit) * (tau - tau.mean(axis=0)) / np.abs(tau - tau.mean(axis=0)).max(axis=0))
@@ -251,3 +251,22 @@ def test_all_joints_that_step_at_once_are_cut_there(tx40: RobotConfig) -> None:
     q[4000:] += [0.1, -0.2, 0.15, 0.3, -0.4, 0.2]
     result = found(t, q, tau, tx40)
     assert np.flatnonzero(result.wrong).tolist() == [3998, 3999, 4000, 4001]
+
+
+@pytest.mark.parametrize("offset", [0, 17])
+def test_a_sign_bit_is_found_in_the_noise_of_the_load(offset: int) -> None:
+    rng = np.random.default_rng(1)
+    load = np.rint(600.0 * np.sin(np.arange(4000) / 400.0) + rng.normal(0.0, 100.0, 4000))
+    found = sign_bit(np.where(load < 0, 1024 - load, load) + offset)
+    assert found is not None
+    assert found.how == "bit 10 is the sign"
+    assert sign_bit(np.abs(load) + offset) is None
+    assert sign_bit(load + 1024) is None
+
+
+def test_an_effort_without_sign_is_not_advised_to_be_in_mnm(tx40: RobotConfig) -> None:
+    t, q, tau = motion(np.random.default_rng(2), 500.0)
+    raw = np.rint(900.0 * tau / np.abs(tau).max(axis=0))
+    with pytest.raises(DataError, match="never negative: counts with another zero or sign") as refused:
+        recording_of_arrays(t, q, raw + 2048, tx40)
+    assert "mnm" not in str(refused.value)

@@ -322,6 +322,40 @@ def test_of_two_arms_the_recorded_one_is_taken(tmp_path: Path) -> None:
     ]
 
 
+def test_recorded_joints_behind_a_fork_are_no_load(tmp_path: Path) -> None:
+    links = [
+        ("turret", "base", "0 0 1"),
+        ("boom", "turret", "0 1 0"),
+        ("stick", "boom", "0 1 0"),
+        ("mast", "turret", "1 0 0"),
+    ]
+    elements = [
+        f'<link name="{name}"/><joint name="j_{name}" type="revolute"><parent link="{parent}"/><child link="{name}"/>'
+        f'<origin xyz="0.1 0 0.3"/><axis xyz="{axis}"/></joint>'
+        for name, parent, axis in links
+    ]
+    arms = {
+        "mast.urdf": (
+            ["turret", "boom", "stick"],
+            elements,
+            "link 'turret' branches into joints 'j_boom' and 'j_mast'",
+        ),
+        "torso.urdf": (["boom", "stick"], elements, ""),
+    }
+    for file, (recorded, written_elements, said) in arms.items():
+        (tmp_path / file).write_text(f'<robot name="r"><link name="base"/>{"".join(written_elements)}</robot>')
+        t = np.arange(1000) / 500
+        columns = [f"j_{name}/{q}" for q in ("position", "effort") for name in recorded]
+        rows = np.column_stack([t, *(np.sin(t + k) for k in range(len(columns)))])
+        lines = [",".join(["t", *columns]), *(",".join(f"{x:.6f}" for x in row) for row in rows)]
+        (tmp_path / "d.csv").write_text("\n".join(lines))
+        out = tmp_path / file.removesuffix(".urdf")
+        made = run("init", str(tmp_path / file), "--recording", str(tmp_path / "d.csv"), "--out", str(out))
+        assert made.exit_code == (2 if said else 0), made.output
+        assert said in made.stderr
+    assert [joint.name for joint in load_robot(out / "robot.yaml", "").joints] == ["j_boom", "j_stick"]
+
+
 @pytest.mark.slow
 def test_a_recording_keeps_the_blanks_of_its_robot(tmp_path: Path) -> None:
     recorded = arms.recording("emps", "emps_1", 0)

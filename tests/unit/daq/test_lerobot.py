@@ -220,3 +220,35 @@ def test_a_calibration_that_does_not_fit_is_refused_in_one_line(tmp_path: Path, 
         calibration.write_text(text)
     with pytest.raises(ConfigError, match=words):
         import_recording(folder, TX40, units={"position": str(calibration)})
+
+
+def test_efforts_in_the_state_of_a_lerobot_data_set_are_found_by_name(tmp_path: Path) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    data = lerobot(tmp_path / "a", [f"joint_{j + 1}.{q}" for j in range(N) for q in ("pos", "vel", "torque")])
+    values = motion(300, 50.0)
+    state = np.stack([values[:, 1 : N + 1], 0.0 * values[:, 1 : N + 1], values[:, N + 1 :]], axis=2).reshape(300, -1)
+    table = pyarrow.parquet.read_table(data).drop_columns(["observation.effort", "observation.state"])
+    pyarrow.parquet.write_table(table.append_column("observation.state", pyarrow.array(state.tolist())), data)
+    found = import_recording(tmp_path / "a", TX40)
+    assert same(found, values)
+    assert "demand" in found.samples.fields
+    assert "positions are taken as rad; LeRobot's default is" in found.metadata["source_remarks"]
+
+
+def test_counts_and_milliamperes_of_a_lerobot_data_set_are_named(tmp_path: Path) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    data = lerobot(tmp_path / "a", None, "observation.current")
+    table = pyarrow.parquet.read_table(data)
+    for column, factor, zero, said in (
+        ("observation.state", 4096 / 6.283, 2048, "counts of the servos have to be converted"),
+        ("observation.current", 1000.0, 0, "--units current=ma if they are in ma at all joints"),
+    ):
+        values = (np.stack(table[column].to_numpy()) * factor + zero).tolist()
+        place = table.schema.get_field_index(column)
+        pyarrow.parquet.write_table(table.set_column(place, column, pyarrow.array(values)), data)
+        with pytest.raises(DataError, match=said):
+            import_recording(data, TX40)

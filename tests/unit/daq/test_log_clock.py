@@ -108,3 +108,6 @@ def test_a_second_run_in_a_log_is_named_with_its_line(tmp_path: Path) -> None:
         read(path)
     found = recording_from_log(path, with_sync(counter=0), ROBOT)
     assert "or another run begins there: write one file for each" in found.metadata["source_remarks"]
+    later = candump(tmp_path / "c.log", lines, lambda t: t + 100).read_text()
+    path.write_text(candump(tmp_path / "b.log", lines, lambda t: t).read_text() + later)
+    assert "or another run begins there: write one file for each" in read(path).metadata["source_remarks"]

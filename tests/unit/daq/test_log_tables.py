@@ -1,6 +1,6 @@
 """Bus logs in CSV, whatever their tool, and of BUSMASTER."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import can
@@ -44,6 +44,19 @@ def with_spaces(m: can.Message) -> str:
     return f"{since(m) * 1e3:.4f}\t0x{m.arbitration_id:03X}\t{len(m.data)}\t{m.data.hex(' ')}"
 
 
+def in_decimal(m: can.Message) -> str:
+    return f"{since(m):.6f},{m.arbitration_id},{len(m.data)},{' '.join(map(str, m.data))}"
+
+
+def with_columns_of_bytes(m: can.Message) -> str:
+    data = [f"0x{octet:02X}" for octet in m.data] + [""] * (8 - len(m.data))
+    return f"0;0x{m.arbitration_id:X};{len(m.data)};{';'.join(data)};{since(m):.6f}"
+
+
+def with_time_of_day(m: can.Message) -> str:
+    return f"23:15:{since(m):09.6f},{m.arbitration_id:X},{m.data.hex('-')}"
+
+
 def with_decimal_commas(m: can.Message) -> str:
     return f"{since(m):.6f};{m.arbitration_id:X}h;{len(m.data)};{m.data.hex()}".replace(".", ",")
 
@@ -57,6 +70,10 @@ FORMS = {
     ),
     "bytes with spaces": ("Time [ms]\tCAN ID\tLength\tData", with_spaces),
     "decimal commas": ("Time;ID;DLC;Data", with_decimal_commas),
+    "decimal": ("Time (s),CAN ID (dec),DLC,Data", in_decimal),
+    "columns with 0x": ("Channel;ID;DLC;" + ";".join(f"D{k}" for k in range(8)) + ";Time", with_columns_of_bytes),
+    "time of day": ("Time,ID,Data", with_time_of_day),
+    "us since 1970": ("timestamp,id,data", lambda m: f"{round(m.timestamp * 1e6)},{m.arbitration_id:x},{m.data.hex()}"),
     "ns": ("time_ns,id,data", lambda m: f"{round(since(m) * 1e9)},{m.arbitration_id:x},{m.data.hex()}"),
 }  # fmt: skip
 
@@ -76,6 +93,18 @@ def test_times_without_their_unit_are_named(tmp_path: Path, unit: str, factor: f
     with pytest.raises(DataError, match=rf"times in {unit} fit SYNC every .*: name their column 'time \[{unit}\]'"):
         import_recording(table(tmp_path / "a.csv", "time,id,data", rows), SESSION)
     assert same(import_recording(table(tmp_path / "b.csv", f"time [{unit}],id,data", rows), SESSION))
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        (lambda m: f"{since(m):.6f},{m.arbitration_id},{m.data.hex()}", "128 is SYNC in decimal: .* 'ID (dec)'"),
+        (lambda m: f"{since(m):.6f},{m.arbitration_id:x},x {m.data.hex(' ')}", "data have two hexadecimal digits"),
+    ],
+)
+def test_numbers_of_another_base_are_named(tmp_path: Path, row: Callable[[can.Message], str], said: str) -> None:
+    with pytest.raises(DataError, match=said.replace("(", r"\(").replace(")", r"\)")):
+        import_recording(table(tmp_path / "a.csv", "time,id,data", map(row, messages())), SESSION)
 
 
 def test_the_csv_of_python_can_is_read(tmp_path: Path) -> None:

@@ -3,11 +3,14 @@
 from pathlib import Path
 
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 import pytest
 from typer.testing import CliRunner
 
 from armident.configs import ConfigError, DataError
 from armident.daq.cli import application
+from armident.daq.interchange.exporting import export_recording
 from armident.daq.interchange.importing import import_recording
 from tests.unit.daq.tables import NAMES, N, motion, same, written
 from tests.unit.daq.test_importing import PANDA, TX40, moving_panda
@@ -280,3 +283,51 @@ def test_durations_are_times(tmp_path: Path) -> None:
     times = (values[:, 0] * 1e9).round().astype("m8[ns]")
     np.savez(tmp_path / "a.npz", t=times, q=values[:, 1 : N + 1], tau=values[:, N + 1 :])
     assert import_recording(tmp_path / "a.npz", TX40).sample_rate_hz == pytest.approx(1000.0)
+
+
+@pytest.mark.parametrize("order", ["blocks", "reversed blocks", "shuffled"])
+def test_rows_out_of_order_are_sorted_by_even_times(tmp_path: Path, order: str) -> None:
+    blocks = np.split(np.arange(1000), 10)
+    rows = {
+        "blocks": np.concatenate(blocks[::-1]),
+        "reversed blocks": np.concatenate([block[::-1] for block in blocks]),
+        "shuffled": np.random.default_rng(4).permutation(1000),
+    }[order]
+    found = import_recording(written(tmp_path / "a.csv", motion(1000)[rows], cell="{:.9f}"), TX40)
+    assert same(found, motion(1000))
+    assert "sorted by time" in found.metadata["source_remarks"]
+    overlapping = motion(1000)
+    overlapping[600:, 0] -= 0.1004
+    with pytest.raises(DataError, match="another run begins here"):
+        import_recording(written(tmp_path / "b.csv", overlapping, cell="{:.9f}"), TX40)
+
+
+def test_the_rate_of_times_in_whole_seconds_is_that_of_their_changes(tmp_path: Path) -> None:
+    values = motion(4000, 250.0)
+    values[2001, 1:] = values[2000, 1:]  # no duplicate row, although its time is the same
+    values[:, 0] = np.floor(values[:, 0] + 0.7)
+    path = written(tmp_path / "a.csv", values, cell="{:.9f}")
+    with pytest.raises(DataError, match=r"too few digits: .* 250 Hz on average .*--rate 250 if the samples are even"):
+        import_recording(path, TX40)
+    found = import_recording(path, TX40, rate_hz=250.0)
+    assert found.samples.sync.size == 4000
+    np.testing.assert_allclose(found.samples.si("position"), values[:, 1 : N + 1], atol=1e-8)
+
+
+@pytest.mark.parametrize("how", ["date", "epoch", "parquet"])
+def test_the_date_of_times_stays_in_recording_and_export(tmp_path: Path, how: str) -> None:
+    values = motion(200)
+    if how == "parquet":
+        stamps = np.datetime64("2026-03-06T15:00:00", "ns") + np.rint(1e9 * values[:, 0]).astype("timedelta64[ns]")
+        path = tmp_path / "a.parquet"
+        columns = {"timestamp": stamps, **dict(zip(NAMES[1:], values[:, 1:].T, strict=True))}
+        pyarrow.parquet.write_table(pyarrow.table(columns), path)
+    else:
+        path = written(tmp_path / "a.csv", values, cell="{:.9f}")
+        names, *rows = path.read_text().splitlines()
+        begin = "2026-03-06T15:00:00" if how == "date" else "1772809200"
+        path.write_text("\n".join([names, *(f"{begin}{row[1:]}" for row in rows)]) + "\n")
+    found = import_recording(path, TX40)
+    assert found.samples.t_ns[0] == 1_772_809_200_000_000_000
+    export_recording(found, tmp_path / "b.csv")
+    assert (tmp_path / "b.csv").read_text().startswith("t [s since 2026-03-06T15:00:00.000000000Z],")
