@@ -64,7 +64,7 @@ def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells"),
     found = _shipped(path)
     if found is not None:
         return found
-    shipped = ", ".join(sorted(p.name for folder in listed for p in (HERE / folder).glob("*.yaml")))
+    shipped = ", ".join(sorted(p.name for folder in listed for p in (HERE / folder).glob("*.[ye]*")))
     raise ConfigError(f"{name}: no such file (shipped with armident: {shipped})")
 
 
