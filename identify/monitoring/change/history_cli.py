@@ -63,7 +63,11 @@ def _copied(word: str, files: Sequence[Path], database: str) -> int:
         return 0
     if not file.is_file():
         raise ConfigError(f"{file}: no such file")
-    added = History(f"sqlite:///{file}").copy_to(History(database))
+    try:
+        copy = History(f"sqlite:///{file}")
+    except ConfigError as error:
+        raise ConfigError(str(error).removeprefix("sqlite:///")) from error
+    added = copy.copy_to(History(database))
     print(f"restored {added} identifications; those that the history had already are unchanged")
     return 0
 
