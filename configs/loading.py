@@ -192,17 +192,9 @@ def _others(count: int) -> str:
 
 
 def load_trajectory(name: str | Path) -> Trajectory:
-    """Load a reference trajectory.
+    """Load a reference trajectory; ``name``: a path, or the name of a shipped file (see `config_path`).
 
-    Parameters
-    ----------
-    name
-        A path, or the name of a shipped file (see `config_path`).
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing or wrong; names file, key and expected value.
+    Raises ConfigError if the file is missing or wrong; names file, key and expected value.
     """
     return _load(config_path(name), Trajectory)
 
@@ -281,17 +273,9 @@ def _with_known_joints(session: SessionConfig, robot: RobotConfig, path: Path) -
 
 
 def load_scenario(name: str | Path) -> Scenario:
-    """Load the hidden effects of a virtual arm.
+    """Load the hidden effects of a virtual arm; ``name``: a path, or the name of a file in ``configs/scenarios``.
 
-    Parameters
-    ----------
-    name
-        A path, or the name of a file in ``configs/scenarios``.
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing or wrong; names file, key and expected value.
+    Raises ConfigError if the file is missing or wrong; names file, key and expected value.
     """
     return _load(config_path(name, listed=("scenarios",)), Scenario)
 
