@@ -64,7 +64,7 @@ def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells"),
     found = _shipped(path)
     if found is not None:
         return found
-    shipped = ", ".join(sorted(p.name for folder in listed for p in (HERE / folder).glob("*.yaml")))
+    shipped = ", ".join(sorted(p.name for folder in listed for p in (HERE / folder).glob("*.[ye]*")))
     raise ConfigError(f"{name}: no such file (shipped with armident: {shipped})")
 
 
@@ -192,17 +192,9 @@ def _others(count: int) -> str:
 
 
 def load_trajectory(name: str | Path) -> Trajectory:
-    """Load a reference trajectory.
+    """Load a reference trajectory; ``name``: a path, or the name of a shipped file (see `config_path`).
 
-    Parameters
-    ----------
-    name
-        A path, or the name of a shipped file (see `config_path`).
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing or wrong; names file, key and expected value.
+    Raises ConfigError if the file is missing or wrong; names file, key and expected value.
     """
     return _load(config_path(name), Trajectory)
 
@@ -282,17 +274,9 @@ def _with_known_joints(session: SessionConfig, robot: RobotConfig, path: Path) -
 
 
 def load_scenario(name: str | Path) -> Scenario:
-    """Load the hidden effects of a virtual arm.
+    """Load the hidden effects of a virtual arm; ``name``: a path, or the name of a file in ``configs/scenarios``.
 
-    Parameters
-    ----------
-    name
-        A path, or the name of a file in ``configs/scenarios``.
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing or wrong; names file, key and expected value.
+    Raises ConfigError if the file is missing or wrong; names file, key and expected value.
     """
     return _load(config_path(name, listed=("scenarios",)), Scenario)
 

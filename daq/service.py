@@ -338,7 +338,7 @@ def _removals(system: System, cell: str) -> Iterator[InstallStep]:
     files = [*own, *([*units, system.root / "etc/tmpfiles.d/armident.conf"] if units else [])]
     for file in files:
         if file.is_file():
-            kind = "unit" if file in units else "folders"
+            kind = "unit" if file in (*units, own[1]) else "file"
             yield step(f"remove {kind} /{file.relative_to(system.root)}", file.unlink)
     if own[1].is_file() and len(list(own[1].parent.iterdir())) == 1:
         yield step(f"remove folder /{own[1].parent.relative_to(system.root)}", own[1].parent.rmdir)

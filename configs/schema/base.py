@@ -62,15 +62,7 @@ class WithBlanks(FrozenModel):
 def split_docstring(docstring: str) -> tuple[str, dict[str, str]]:
     """Split a numpydoc docstring into its text and the descriptions of its parameters, each on one line.
 
-    Parameters
-    ----------
-    docstring
-        Docstring whose last section is Parameters, or one without that section.
-
-    Returns
-    -------
-    tuple of str and dict
-        The text before the section; descriptions by name. Names that share a description each have it.
+    Parameters is its last section, or missing. Names that share a description each have it.
     """
     text = inspect.cleandoc(docstring)
     section = _PARAMETERS.search(text)

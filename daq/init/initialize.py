@@ -1,12 +1,13 @@
 """The command ``armident init``: writes robot and session, and says what was found, assumed, and is still missing."""
 
+import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from armident.configs import ConfigError, RobotConfig, load_robot, load_session
+from armident.configs import ConfigError, RobotConfig, config_path, load_robot, load_session
 from armident.configs.blanks import MARK, NEEDS, grouped, pattern
 from armident.daq.init.dh_table import Convention, from_dh_table
 from armident.daq.init.geometry import Geometry, from_library, from_urdf, of_axes
@@ -64,7 +65,7 @@ def run_init(options: InitOptions) -> str:
     robot = robot_content(geometry, facts, options.signal, options.gravity, options.link_torques)
     robot["name"] = options.name or robot["name"]
     signal = _signal(robot)
-    cell = CellFacts(**{"cell": f"{robot['name']}_cell", **options.cell})
+    cell = CellFacts(**{"cell": f"{robot['name']}_cell", **options.cell, **_data_sheet(options)})
     session = session_content(geometry.robot, signal, facts, cell)
     sources = geometry.source if facts is None else f"{geometry.source} and {facts.path.name}"
     head = f"# Written by armident init from {sources}. {MARK} marks a value that is not known yet.\n"
@@ -72,6 +73,14 @@ def run_init(options: InitOptions) -> str:
     robot_file.write_text(head + yaml_text(robot), encoding="utf-8")
     session_file.write_text(head + yaml_text(session), encoding="utf-8")
     return summary(robot_file, session_file, geometry, facts)
+
+
+def _data_sheet(options: InitOptions) -> dict[str, str]:
+    """Return the data sheet of the drives as the session names it: relative to its folder, or a shipped file."""
+    if (eds := options.cell.get("eds")) is None:
+        return {}
+    file = config_path(eds, ("eds",))
+    return {"eds": os.path.relpath(file.resolve(), options.out.resolve()) if file == Path(eds) else eds}
 
 
 def _geometry(options: InitOptions) -> Geometry:
@@ -126,6 +135,10 @@ def summary(robot_file: Path, session_file: Path, geometry: Geometry, facts: Rec
         *_blank_lines(session_file.name, session.blanks, robot.n),
     ]
     lines += [f"blanks, marked {MARK}:", *blanks] if blanks else ["no blanks"]
+    if facts is None and "bus.channel" not in session.blanks:
+        return "\n".join(
+            [*lines, "next:", f"  armident doctor --for capture --config {shlex.quote(str(session_file))}"]
+        )
     return "\n".join([*lines, *_next(robot_file, facts, robot)])
 
 

@@ -57,22 +57,8 @@ def recover_recording(path: Path | str) -> Recovered:
     before the end are damaged, a file without them replaces the damaged one, which is kept under its name with
     ``.damaged`` added.
 
-    Parameters
-    ----------
-    path
-        The MCAP file.
-
-    Returns
-    -------
-    Recovered
-        The path, and a description of the missing parts.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such file, it is being written, or it cannot be written.
-    DataError
-        If it is not a recording of armident, or ends before its first chunk.
+    Raises ConfigError if there is no such file, it is being written, or it cannot be written. Raises DataError if it is
+    not a recording of armident, or ends before its first chunk.
     """
     path = Path(path)
     try:

@@ -177,7 +177,7 @@ class RecordingScan:
             since = "from the start" if last_sync is None else f"after SYNC {last_sync}"
             words.append(
                 f"the file was not finished: rows {since} and the counters are missing"
-                f" ({len(self._data) - self.end} bytes of an incomplete record left out)"
+                f" ({len(self._data) - self.end} bytes left out)"
             )
         return words
 

@@ -10,7 +10,7 @@ from armident.identify.api.result_base import Result
 from armident.identify.api.result_tables import Table
 from armident.identify.documents.base import plain, reference, versions
 from armident.identify.documents.setup import SetupDocument, SetupMistake
-from armident.identify.identification.from_recording import OUTSIDE, experiments_of
+from armident.identify.identification.from_recording import OUTSIDE, TORN, experiments_of
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck
 
@@ -134,7 +134,10 @@ def check(recordings: Recorded | Sequence[Recorded], robot: Robot | None = None)
         corrected_configuration=None if corrected is None else corrected.model_dump(mode="json", by_alias=True),
         clock=float(found.clock),
         torque_shift=None if found.torque_shift is None else plain(found.torque_shift),
-        repairs=[*(note for _, notes in usable for note in notes), *(note for note in remarks if OUTSIDE in note)],
+        repairs=[
+            *(note for _, notes in usable for note in notes),
+            *(note for note in remarks if OUTSIDE in note or TORN in note),
+        ],
         versions=versions(),
     )
     return CheckedSetup(document, corrected, found)

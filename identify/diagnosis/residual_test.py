@@ -12,6 +12,7 @@ from scipy.special import chdtrc, fdtr, fdtrc
 
 from armident.arrays import Array
 from armident.identify.documents.identification import IdentificationDocument, ResidualStatistics
+from armident.identify.documents.rounding import chance
 from armident.identify.regression.multiple_testing import holm
 
 SAME_MOTION = 0.1
@@ -44,16 +45,14 @@ class ResidualChange:
     @property
     def words(self) -> str:
         """Result in one sentence, which begins with the joint."""
-        chance = f"p = {self.p_value:.1g}" if self.p_value >= 1e-12 else "p = below 1e-12"
+        p = chance(self.p_value)
         if self.band_hz is not None:
             low, high = self.band_hz
-            return (
-                f"{self.joint}: power of the residuals from {low:.3g} to {high:.3g} Hz x {self.statistic:.3g}, {chance}"
-            )
+            return f"{self.joint}: power of the residuals from {low:.3g} to {high:.3g} Hz x {self.statistic:.3g}, {p}"
         of = "position and direction" if self.kind == "position" else "velocity"
         return (
             f"{self.joint}: dependence of the residuals on {of} has changed "
-            f"(chi-square {self.statistic:.1f} of {self.degrees:.0f} degrees of freedom), {chance}"
+            f"(chi-square {self.statistic:.1f} of {self.degrees:.0f} degrees of freedom), {p}"
         )
 
 

@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from armident.identify.documents.base import Document, RecordingReference, SignedDocument
+from armident.identify.documents.rounding import chance
 
 LEVEL_95 = 1.959964
 """Half width of a 95 % interval of a normal distribution, standard deviations."""
@@ -156,7 +157,7 @@ class ComparisonDocument(SignedDocument):
     @property
     def sentence(self) -> str:
         """Verdict in one sentence."""
-        test = f"chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom, p = {self.p_value:.2g}"
+        test = f"chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom, {chance(self.p_value)}"
         names = [each.name for each in self.parameters if each.changed]
         parts = [*names, *self.changed_groups, *self.changed_residuals] or ["no single parameter significantly"]
         if self.changes:

@@ -25,6 +25,11 @@ def alike(value: float, std: float | None) -> tuple[str, str]:
     return text.format(round(value, decimals) + 0.0), text.format(round(std, decimals))
 
 
+def chance(p: float) -> str:
+    """Return a p-value as a relation, ``p = 0.0034`` or ``p < 1e-12``: a smaller one is rounded to zero by its test."""
+    return f"p = {p:.2g}" if p >= 1e-12 else "p < 1e-12"
+
+
 def plus_minus(value: float, std: float | None) -> str:
     """Return ``value ± std`` as `alike` rounds them.
 

@@ -12,6 +12,7 @@ import numpy as np
 from armident.arrays import Array
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
+from armident.identify.documents.rounding import plus_minus
 from armident.identify.robot.motion import Motion
 
 Shapes = tuple[tuple[str, float], ...]
@@ -281,7 +282,7 @@ class Effect(ABC):
         joint, values, std
             Name of the joint, estimable linear parameters by name, and their standard deviations.
         """
-        each = ", ".join(f"{name} {value:+.3g} (standard deviation {std[name]:.2g})" for name, value in values.items())
+        each = ", ".join(f"{name} {plus_minus(value, std[name])}" for name, value in values.items())
         words = f"{self.change_title or self.title} at {joint}"
         return f"{words}: {each}" if each else words
 
@@ -374,11 +375,7 @@ class Effect(ABC):
         """Return a friction parameter of the joint and factors (k,) of the linear ones: their sum is not negative.
 
         An empty name for most effects. Viscous friction never falls with the speed, and Coulomb friction is positive.
-
-        Parameters
-        ----------
-        shapes
-            Nonlinear parameters by name.
+        ``shapes``: nonlinear parameters by name.
         """
         return "", np.zeros(len(self.linear))
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from armident.arrays import Array
+from armident.identify.documents.rounding import plus_minus
 from armident.identify.effects.effect import TORQUE, Effect, Linear, Place, TorqueDependent
 from armident.identify.effects.free_shapes import OverPosition, table, values
 from armident.identify.effects.parameter_change import ParameterChange
@@ -108,14 +109,14 @@ class Payload(ParameterChange):
         """Return mass and centre of mass, or the moments of mass, as far as they are estimable."""
         mass, moments = values.get("mp", 0.0), {name: values[name] for name in ("mxp", "myp", "mzp") if name in values}
         if "mp" in values and abs(mass) > 3 * std["mp"]:
-            words = f"{abs(mass):.3g} kg (standard deviation {std['mp']:.2g} kg) {'more' if mass > 0 else 'less'}"
+            words = f"{plus_minus(abs(mass), std['mp'])} kg {'more' if mass > 0 else 'less'}"
             words += f" on the link of {joint} than in the baseline"
             if len(moments) == 3:
                 at = ", ".join(f"{moment / mass:.3f}" for moment in moments.values())
                 words += f", centre of mass at ({at}) m in the frame of the link"
             return words
         words = f"another load on the link of {joint} than in the baseline"
-        each = ", ".join(f"{n[:2]} {v:+.3g} kg m (standard deviation {std[n]:.2g})" for n, v in moments.items())
+        each = ", ".join(f"{n[:2]} {plus_minus(v, std[n])} kg m" for n, v in moments.items())
         return f"{words}: moment of mass {each}" if each else words
 
 

@@ -25,8 +25,8 @@ MIN_PIECE_S = 0.5
 """Shortest piece between two gaps, s: edge effects of the filters cover shorter ones."""
 RATE_TOLERANCE = 0.01
 """Relative difference between the nominal rate and the receive times above which a note is added."""
-OUTSIDE = "outside its limits"
-"""Part of the note on positions that pass the limits of their joint."""
+OUTSIDE, TORN = "outside its limits", "the recording is torn"
+"""Parts of the notes on positions that pass the limits of their joint, and on a file that was not finished."""
 NO_REFERENCE = "no reference trajectory was recorded: identified without one"
 """Note on a recording without demands."""
 BRIDGED = 2
@@ -82,7 +82,7 @@ def _converted(
     recorded = np.concatenate([recording.samples.sync, *left_out])
     notes = list(remarks)
     if recording.missing:
-        notes.append(f"the recording is torn: {recording.missing}")
+        notes.append(f"{TORN}: {recording.missing}")
     samples = recording.samples
     dt = 1.0 / recording.sample_rate_hz
     demand = _demand_stream(recording)

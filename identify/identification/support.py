@@ -7,6 +7,7 @@ import numpy as np
 from scipy import linalg
 
 from armident.arrays import Array, Mask
+from armident.identify.documents.rounding import plus_minus
 from armident.identify.identification.equations import Prepared
 from armident.identify.identification.identification_criteria import IdentificationCriteria
 from armident.identify.identification.identification_result import units
@@ -59,7 +60,7 @@ class Support:
         if found.size > criteria.max_listed:
             return count
         unit = units(model)
-        values = [f"{model.base.names[k]} = {self.theta[k]:.3g} +- {self.std[k]:.1g} {unit[k]}" for k in found]
+        values = [f"{model.base.names[k]} = {plus_minus(self.theta[k], self.std[k])} {unit[k]}" for k in found]
         return f"{count}, each with what cannot be separated from it: {enumerated(values, criteria.max_listed)}"
 
 

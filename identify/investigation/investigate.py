@@ -42,6 +42,8 @@ from armident.identify.signals.bandwidth import motion_bandwidth
 
 FILE, ROBOT, MODEL, BASELINE = "investigation.json", "robot.yaml", "model.yaml", "baseline.json"
 """Files of a folder: the document, the configuration, the same with what was found, and the arm before it changed."""
+AGAIN = "Find the cause before the arm moves again; then begin with another --out"
+"""The next step where the arm did not move, or was stopped."""
 
 
 class Waiting(Exception):
@@ -102,7 +104,10 @@ class Investigating:
             progress(f"round {len(self.document.rounds) + 1}: {stage}", share)
 
         if not self.recordings:
-            self._affordable(first_motion(self.robot, self.collision))
+            if rounds := self.document.rounds:
+                self._stop(f"{rounds[-1].chosen.words} was refused: {rounds[-1].refused}. {AGAIN}")
+            else:
+                self._affordable(first_motion(self.robot, self.collision))
             return
         self.result = result = self._diagnosed(report)
         document, rounds, state = result.document, self.document.rounds, result.first
@@ -189,8 +194,7 @@ class Investigating:
             if isinstance(error, DataError):
                 self._update(rounds=refused)
             else:
-                reason = f"{last.chosen.words} was stopped: {error}. Find the cause before the arm moves again"
-                self._stop(f"{reason}; then begin with another --out", rounds=refused)
+                self._stop(f"{last.chosen.words} was stopped: {error}. {AGAIN}", rounds=refused)
             return
         answered = last.model_copy(update={"recording": reference(recording)})
         self._keep(recording, trajectory.duration, [*rounds[:-1], answered])

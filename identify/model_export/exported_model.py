@@ -232,17 +232,9 @@ class ExportedModel:
         return limits if np.isfinite(limits).all() and not self.frames.endless[k] else None
 
     def in_frames_of(self, source: SourceUrdf) -> "ExportedModel":
-        """Return the model with links and joints in the frames and with the names of a URDF.
+        """Return the model with links and joints in the frames and with the names of a URDF and its chain, ``source``.
 
-        Parameters
-        ----------
-        source
-            URDF and chain.
-
-        Raises
-        ------
-        ConfigError
-            If the URDF cannot be read, or has another geometry than the configuration.
+        Raises ConfigError if the URDF cannot be read, or has another geometry than the configuration.
         """
         frames = source_frames(source, self.robot)
         moved, known = self, known_bodies(source, self.arm, frames)

@@ -9,6 +9,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from armident.identify.documents.comparison import LEVEL_95
+from armident.identify.documents.rounding import alike, plus_minus
 from armident.identify.monitoring.change.history import ParameterSeries
 from armident.identify.page.cells import LARGEST
 
@@ -34,7 +35,8 @@ def sparkline(series: ParameterSeries, changed: bool) -> Markup:
         return round(HEIGHT - MARGIN - (value - min(ends)) * scale, 2)
 
     points = [(round(MARGIN + k * step, 2), y(value)) for k, value in enumerate(series.values)]
-    words = f"{series.name}: {first:.4g} to {last:.4g} ± {of_last:.2g} {series.unit}, runs: {len(series.values)}"
+    change = f"{alike(first, of_last)[0]} to {plus_minus(last, of_last)} {series.unit}"
+    words = f"{series.name}: {change}, runs: {len(series.values)}"
     return _SPARKLINE.format(
         words=f"{words}{', changed' if changed else ''}",
         band=(y(first + of_first), round(2 * of_first * scale, 2)),

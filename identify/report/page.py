@@ -12,7 +12,7 @@ import matplotlib
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
 
-from armident.identify.documents.rounding import alike
+from armident.identify.documents.rounding import alike, chance
 from armident.identify.report.glossary import CONVENTIONS, in_words, mentioned
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ def templates_of(package: str) -> Environment:
     found.filters["words"] = in_words
     found.filters["mentioned"] = mentioned
     found.filters["alike"] = alike
+    found.filters["chance"] = chance
     found.filters["g"] = lambda value, digits=4: "" if value is None else f"{value:.{digits}g}"
     found.filters["fixed"] = lambda value, digits=2: "" if value is None else f"{value:.{digits}f}"
     return found

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from armident.configs import RobotConfig
+from armident.identify.documents.rounding import plus_minus
 from armident.identify.signals.experiments import Experiment
 from armident.identify.signals.streamed import mapped
 
@@ -137,7 +138,7 @@ class TorqueShift:
         reason = "torques of the instant of the sample" if by_convention else "their own sampling instant"
         return (
             f"all torques are {size} {'late' if late > 0 else 'early'} against torques held until the next sample "
-            f"({reason}; estimated: {self.samples:.2f} +- {self.std:.2f} samples): identify and diagnose align their "
+            f"({reason}; estimated: {plus_minus(self.samples, self.std)} samples): identify and diagnose align their "
             "equations with it"
         )
 

@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import assert_type
 
@@ -109,6 +110,12 @@ def test_a_check_remarks_positions_outside_their_limits(axis: armident.Identific
     narrow = robot.model_copy(update={"joints": (joint.model_copy(update={"limits": limits}),)})
     checked = armident.check(axis.recordings, narrow)
     assert "outside its limits [-0.01, 0.01]: wrong unit, order of joints, or limits?" in str(checked)
+
+
+def test_a_check_remarks_that_a_recording_is_torn(axis: armident.Identification) -> None:
+    torn = replace(axis.recordings[0], missing="the file was not finished")
+    assert "remark: " in (words := str(armident.check(torn)))
+    assert "the recording is torn: the file was not finished" in words
 
 
 def test_a_model_without_parameters_says_where_they_come_from() -> None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from armident.identify.documents.rounding import plus_minus
 from armident.identify.estimators.reason import Reason
 from armident.identify.identification.checks.judged import Judged
 from armident.identify.identification.identification_criteria import IdentificationCriteria
@@ -16,7 +17,7 @@ def delay(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
         return []
     off = found.contradicts() & (np.abs(found.samples - HELD) > criteria.max_delay_samples)
     late = [
-        f"{joint.name} {samples:.1f} +- {std:.1f}"
+        f"{joint.name} {plus_minus(samples, std)}"
         for joint, samples, std, wrong in zip(robot.joints, found.samples, found.std, off, strict=True)
         if wrong
     ]

@@ -5,6 +5,7 @@ from scipy.special import chdtri
 
 from armident.arrays import Array
 from armident.configs import ArmidentError
+from armident.identify.documents.rounding import plus_minus
 from armident.identify.estimators.reason import Reason
 from armident.identify.identification.checks.excitation import motion_postures, workspace_postures
 from armident.identify.identification.checks.judged import Judged
@@ -83,7 +84,7 @@ def _negative(model: ArmModel, theta: Array, covariance: Array, criteria: Identi
         and theta[k] < -criteria.sign_tolerance_std * std[k]
     ]
     found.sort(key=lambda k: theta[k] / std[k])
-    values = [f"{rigid[k]} = {theta[k]:.3g} +- {std[k]:.1g} {unit[k]}" for k in found]
+    values = [f"{rigid[k]} = {plus_minus(theta[k], std[k])} {unit[k]}" for k in found]
     return [f"negative {enumerated(values, 3)}"] if values else []
 
 
@@ -106,6 +107,6 @@ def _indefinite(
         return []
     negative = 100 * float(np.mean(values[:, 0] < 0))
     return [
-        f"the mass matrix is not positive definite (smallest eigenvalue {values[worst, 0]:.2g} +- {std[worst]:.1g}, "
+        f"the mass matrix is not positive definite (smallest eigenvalue {plus_minus(values[worst, 0], std[worst])}, "
         f"negative at {negative:.0f} % of the postures)"
     ]

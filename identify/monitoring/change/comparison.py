@@ -19,6 +19,7 @@ from armident.identify.documents.comparison import (
     NamedChange,
 )
 from armident.identify.documents.identification import IdentificationDocument, Parameter
+from armident.identify.documents.rounding import chance, plus_minus
 from armident.identify.effects.terms import terms_of
 from armident.identify.identification.saved_model import configuration_of
 from armident.identify.monitoring.change.model_differences import model_differences
@@ -223,7 +224,7 @@ def comparison_table(document: ComparisonDocument) -> None:
         if shown:
             print(joint)
         for p in shown:
-            print(f"  {line(rows[p.name])}{f'  changed, p = {p.p_value:.2g}' if p.changed else ''}")
+            print(f"  {line(rows[p.name])}{f'  changed, {chance(p.p_value)}' if p.changed else ''}")
     hidden = len(document.parameters) - len(rows)
     if hidden:
         print(f"{hidden} parameters that are not essential and have not changed are in the report")
@@ -232,5 +233,5 @@ def comparison_table(document: ComparisonDocument) -> None:
 def _row(p: ComparedParameter) -> tuple[str, str, str, str, str]:
     """Return name, both values and their difference with 95 % intervals, and unit."""
     values = ((p.before, p.before_std), (p.now, p.now_std), (p.now - p.before, p.std_of_difference))
-    before, now, difference = (f"{value:.4g} ± {LEVEL_95 * std:.2g}" for value, std in values)
+    before, now, difference = (plus_minus(value, LEVEL_95 * std) for value, std in values)
     return p.name, before, now, difference, p.unit

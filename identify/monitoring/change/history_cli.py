@@ -12,6 +12,7 @@ from armident.identify.diagnosis.baseline_comparison import Inconclusive
 from armident.identify.diagnosis.change_test import ParameterChangeTest, compare
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.documents.rounding import plus_minus
 from armident.identify.monitoring.change.history import History, HistoryRun, recorded_at
 
 
@@ -62,7 +63,11 @@ def _copied(word: str, files: Sequence[Path], database: str) -> int:
         return 0
     if not file.is_file():
         raise ConfigError(f"{file}: no such file")
-    added = History(f"sqlite:///{file}").copy_to(History(database))
+    try:
+        copy = History(f"sqlite:///{file}")
+    except ConfigError as error:
+        raise ConfigError(str(error).removeprefix("sqlite:///")) from error
+    added = copy.copy_to(History(database))
     print(f"restored {added} identifications; those that the history had already are unchanged")
     return 0
 
@@ -143,7 +148,7 @@ def _table(
         table.add_column(heading, justify="left" if heading in ("recording", "compared with the first") else "right")
     first = next((run for run in runs if run.document.converged), None)
     for run, drift in zip(runs, drifts, strict=True):
-        values = {p.name: f"{p.value:.4g} +- {p.std:.1g}" for p in run.document.parameters}
+        values = {p.name: plus_minus(p.value, p.std) for p in run.document.parameters}
         table.add_row(
             f"{run.recorded:%Y-%m-%d %H:%M}",
             Path(run.document.recording.path or "-").name,

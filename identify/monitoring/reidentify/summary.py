@@ -7,6 +7,7 @@ import numpy as np
 from armident.configs import RobotConfig
 from armident.identify.diagnosis.change_test import ParameterChangeTest
 from armident.identify.documents.diagnosis import DiagnosisDocument
+from armident.identify.documents.rounding import chance
 
 _NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")
 CLEAR = 2.0
@@ -31,20 +32,20 @@ def change_lines(drift: ParameterChangeTest, robot: RobotConfig) -> list[str]:
     """One line per change of the plant, parameter, group and residual, or one for all parameters together."""
     lines = [f"{' and '.join(found.change.joints)}: {found.words}" for found in drift.explained]
     p_values = {each.name: float(p) for each, p in zip(drift.parameters, drift.p_values, strict=True)}
-    lines += [_line(drift, name, robot) + f", p = {_p_text(p_values[name])}" for name in drift.changed]
+    lines += [_line(drift, name, robot) + f", {chance(p_values[name])}" for name in drift.changed]
     for group in drift.changed_groups:
         rest = [name for name in group.members if name not in drift.changed]
         if len(rest) == len(group.members):
             where = place_of(rest[0], robot)
             clear = [name for name in rest if _deviations(drift, name) >= CLEAR] or rest
             values = "; ".join(_line(drift, name, robot).removeprefix(f"{where}: ") for name in clear)
-            lines.append(f"{where}: {group.kind} ({values}), together p = {_p_text(group.p_value)}")
+            lines.append(f"{where}: {group.kind} ({values}), together {chance(group.p_value)}")
     lines += [each.words for each in drift.changed_residuals]
     if not lines and drift.drifted:
         z = np.abs(drift.difference) / drift.std
         most = ", ".join(drift.parameters[k].name for k in np.argsort(-z)[:3])
         lines.append(
-            f"no single parameter changed significantly, all together did (p = {_p_text(drift.p_joint)}); most: {most}"
+            f"no single parameter changed significantly, all together did ({chance(drift.p_joint)}); most: {most}"
         )
     return lines
 
@@ -93,7 +94,3 @@ def place_of(name: str, robot: RobotConfig) -> str:
 def meaning_of(name: str) -> str:
     """Return the meaning of a parameter from the first letters of its name."""
     return next((meaning for kind, meaning in _MEANINGS.items() if name.startswith(kind)), "inertia")
-
-
-def _p_text(p: float) -> str:
-    return f"{p:.1g}" if p >= 1e-12 else "below 1e-12"

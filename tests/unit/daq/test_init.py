@@ -12,7 +12,7 @@ import yaml
 from typer.testing import CliRunner, Result
 
 import armident
-from armident.configs import ConfigError, load_robot, load_session
+from armident.configs import ConfigError, config_path, load_robot, load_session
 from armident.configs.blanks import MARK, pattern
 from armident.daq.cli import GROUP, application
 from armident.daq.init.initialize import InitOptions, run_init
@@ -210,6 +210,22 @@ def test_a_filled_in_configuration_has_no_blanks(tmp_path: Path, arm: Path) -> N
     assert session.blanks == ()
     assert "blanks" not in session.model_dump()
     assert load_robot(file).joints[0].drive.counts_per_unit == 65536
+
+
+def test_a_data_sheet_is_found_from_the_working_directory_and_a_missing_one_leaves_no_files(
+    tmp_path: Path, arm: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["init", str(arm), "--eds", "drive.eds", "--out", "cell"]
+    missing = run(*words)
+    assert missing.exit_code == 2
+    assert "drive.eds: no such file (shipped with armident: cia402_servo.eds" in missing.output
+    assert not Path("cell").exists()
+    Path("drive.eds").write_text(config_path("cia402_servo.eds").read_text())
+    assert run(*words).exit_code == 0
+    assert load_session("cell/session.yaml", "command").drives[0].eds.resolve() == tmp_path / "drive.eds"
+    bus = run(*words, "--overwrite", "--channel", "can0")
+    assert bus.stdout.endswith("next:\n  armident doctor --for capture --config cell/session.yaml\n")
 
 
 def test_a_mark_in_a_list_makes_the_list_blank_and_unknown_keys_are_always_needed(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from armident.identify.documents.rounding import alike, plus_minus
+from armident.identify.documents.rounding import alike, chance, plus_minus
 
 
 @pytest.mark.parametrize(
@@ -30,3 +30,7 @@ def test_the_deviation_has_two_digits_and_the_value_the_same_last_one(
 def test_a_value_without_a_deviation_stands_alone() -> None:
     assert plus_minus(3.14159, None) == "3.142"
     assert plus_minus(3.14159, 0.0123) == "3.142 ± 0.012"
+
+
+def test_a_chance_that_its_test_rounds_to_zero_is_a_bound() -> None:
+    assert [chance(p) for p in (0.0337, 2e-11, 0.0)] == ["p = 0.034", "p = 2e-11", "p < 1e-12"]

@@ -228,7 +228,7 @@ def test_late_torques_are_doubtful_in_one_line(arm: RobotConfig) -> None:
     late = TorqueDelay(np.array([-5.5, -5.4, 0.4, 0.6, 0.5, 9.0]), np.array([0.2] * 5 + [8.0]), True)
     (reason,) = delay(judged(robot=arm, statistics=SimpleNamespace(delay=late)), CRITERIA)
     assert reason.level == "doubtful"
-    assert "(joint_1 -5.5 +- 0.2 and joint_2 -5.4 +- 0.2; expected is 0.5)" in reason.message
+    assert "(joint_1 -5.50 ± 0.20 and joint_2 -5.40 ± 0.20; expected is 0.5)" in reason.message
     assert delay(judged(robot=arm, statistics=SimpleNamespace(delay=None)), CRITERIA) == []
 
 

@@ -71,6 +71,23 @@ def test_a_refused_motion_is_noted_and_not_asked_again() -> None:
     assert found.document.motion_s == 0.0
 
 
+def test_a_first_motion_that_is_refused_ends_the_investigation(tmp_path: Path) -> None:
+    """Without a recording there is no other motion to ask for."""
+    asked: list[Trajectory] = []
+
+    def refuses(trajectory: Trajectory) -> armident.Recording:
+        asked.append(trajectory)
+        if len(asked) > 1:
+            pytest.fail("the same motion was asked for again")
+        raise DataError("No module named 'lerobot'")
+
+    found = armident.investigate("emps", refuses, out=tmp_path)
+    assert found.outcome == "cannot_tell"
+    assert "was refused: No module named 'lerobot'. Find the cause" in found.document.statement
+    assert found.save(tmp_path)[1].exists()
+    assert armident.investigate(resume=tmp_path, ask=refuses).document.statement == found.document.statement
+
+
 def test_a_motion_that_was_stopped_is_the_last_one(tmp_path: Path) -> None:
     arm = Arm(None)
 

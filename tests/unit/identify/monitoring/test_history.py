@@ -543,7 +543,7 @@ def test_a_backup_is_not_replaced_by_an_empty_one_nor_by_itself(tmp_path: Path) 
         (["backup", str(copy)], "not written, because the history is empty"),
         (["backup", str(tmp_path / "h.sqlite")], "the history itself"),
         (["restore", str(tmp_path / "gone")], "no such file"),
-        (["restore", str(copy)], "cannot be used as history: damaged"),
+        (["restore", str(copy)], f"armident: {copy}: cannot be used as history: damaged"),
         (["backup"], "expected one file"),
     ):
         code, _, err = call(*words, "--database", url)
