@@ -27,6 +27,9 @@ SHORTEST_MOVE = 0.3
 REACH = (0.15, 0.6)
 """Length of a move as a share of the range: short moves accelerate more, long ones are faster."""
 
+FEWEST_MOVES = 3
+"""Moves that fit the duration at full pace: ranges of two turns would take all of it for one move."""
+
 SLOWEST_PACE = 1.8
 """Slowest pace, as a multiple of the shortest duration: ``fv`` and ``fc`` are separated by different speeds."""
 
@@ -133,13 +136,15 @@ class PointToPointSearch:
 
     def random(self) -> PointToPoint:
         """Return random waypoints within `REACH` of each other, as many as fit the duration; the last one is home."""
+        time = self.duration / FEWEST_MOVES
+        most = np.minimum(time * self.velocity / PEAK_VELOCITY, time**2 * self.acceleration / PEAK_ACCELERATION)
         reach = self.rng.uniform(*REACH) * (self.high - self.low) if self.aim is None else None
         points: list[Array] = []
         paces: list[float] = []
         here, left = self.home, self.duration
         while True:
             way = self._far() if reach is None else reach
-            point = self._waypoint(here, way)
+            point = self._waypoint(here, np.minimum(way, most))
             pace = float(self._pace(1)[0])
             left -= pace * max(float(self._shortest((point - here)[None, :])[0]), SHORTEST_MOVE)
             if left < 0.0 and points:
@@ -147,6 +152,8 @@ class PointToPointSearch:
             points.append(point)
             paces.append(pace)
             here = point
+        if len(points) == 1:
+            points, paces = [*points, self.home], [1.0, 1.0]
         points[-1] = self.home
         return PointToPoint(np.array(points), np.array(paces))
 

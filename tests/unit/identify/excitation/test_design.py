@@ -94,3 +94,12 @@ def test_an_effect_of_predicted_torques_does_not_hinder_a_design(tx40: ArmModel,
     rigid = [TABLE_B4[name][0] if name in TABLE_B4 else 0.0 for name in tx40.base.names]
     theta = [*rigid, *np.zeros(model.e)] if known else None
     design_trajectory(robot, 2.0, evaluations=3, theta=theta).trajectory.check(robot, "design")
+
+
+def test_joints_that_turn_endlessly_move_in_every_design() -> None:
+    """A move over a share of two turns takes all of the duration."""
+    robot = load_robot("kinova_gen3")
+    assert max(joint.limits.position[1] for joint in robot.joints) > 6.0
+    for seed in range(3):
+        found = design_trajectory(robot, seed=seed, evaluations=1).trajectory
+        assert (np.ptp(found.sample(0.01), axis=0) > 0.1).all()
