@@ -19,6 +19,7 @@ from armident.daq.streaming import Keys, encode_event, open_session
 from armident.identify.documents.diagnosis import DiagnosisDocument
 from armident.identify.documents.files import load_document
 from armident.identify.documents.identification import IdentificationDocument
+from armident.identify.documents.rounding import alike
 from armident.identify.monitoring.worker.ledger import FILE, Ledger, view_of
 from armident.identify.page.attention import SILENT_S, CellView, words
 from armident.identify.page.site import PAGE_POLICY, REPORT_POLICY
@@ -50,7 +51,8 @@ def test_a_cell_shows_its_parameters_with_standard_deviations_and_verdict(page: 
     document = load_document(made / "press_2" / f"{NAME}.identification/identification.json", IdentificationDocument)
     _, _, html = page.get("/cells/press_2")
     for p in document.parameters:
-        row = f'<th scope="row">{p.name}</th><td class="n">{p.value:.4g}</td><td class="n">{p.std:.2g}</td>'
+        value, std = alike(p.value, p.std)
+        row = f'<th scope="row">{p.name}</th><td class="n">{value}</td><td class="n">{std}</td>'
         assert row in html
     assert f"{document.verdict} " in text_of(html)
     assert f"{document.relative_error_pct:.1f} %" in html
