@@ -375,7 +375,11 @@ class Effect(ABC):
         """Return a friction parameter of the joint and factors (k,) of the linear ones: their sum is not negative.
 
         An empty name for most effects. Viscous friction never falls with the speed, and Coulomb friction is positive.
-        ``shapes``: nonlinear parameters by name.
+
+        Parameters
+        ----------
+        shapes
+            Nonlinear parameters by name.
         """
         return "", np.zeros(len(self.linear))
 
