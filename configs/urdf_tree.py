@@ -116,11 +116,6 @@ def coarse_right_angles(file: Path) -> set[str]:
     return found
 
 
-def robot_name(file: Path) -> str:
-    """Name of the robot in a URDF, as written; empty if it has none. Raises ConfigError if the file is wrong."""
-    return read_tree(file).name
-
-
 @dataclass(frozen=True)
 class UrdfTree:
     """Links and joints of a URDF; ``above``, ``below``: joint elements by child link, and by parent link."""

@@ -114,7 +114,6 @@ import_.__doc__ = cleandoc(str(import_.__doc__)).replace("FORMATS", help_of_form
 
 
 def _fields(recording: "Recording") -> str:
-    """Return the names of the fields of a recording."""
     return ", ".join(name for stream in recording.streams.values() for name in stream.fields)
 
 

@@ -235,7 +235,6 @@ def install(cell: str, root: Path = Path("/"), executable: Path | None = None, d
 
 
 def _carry_out(open_steps: Sequence[InstallStep], dry_run: bool) -> list[str]:
-    """Carry out steps, and return one line for each."""
     lines = []
     for step in open_steps:
         if not dry_run:

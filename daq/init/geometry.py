@@ -17,7 +17,7 @@ from armident.configs.schema.robot import Mdh
 from armident.configs.urdf import UrdfGeometry, UrdfSource, geometry_from_urdf, joint_names
 from armident.configs.urdf_file import limit_places
 from armident.configs.urdf_inertials import held_joints
-from armident.configs.urdf_tree import coarse_right_angles, moving_links, orientation, robot_name, serial_tips
+from armident.configs.urdf_tree import coarse_right_angles, moving_links, orientation, read_tree, serial_tips
 from armident.configs.yaml_loader import is_file, read_yaml
 
 UPRIGHT = (0.0, 0.0, -9.81)
@@ -141,7 +141,7 @@ def _of_chain(file: Path, out: Path, base: str | None, tip: str | None) -> Geome
     part = UrdfSource(file=str(part_file), base=base, tip=tip)
     made = geometry_from_urdf(UrdfGeometry(urdf=part), out / "robot.yaml")
     urdf = {"file": os.path.relpath(part.file, out.resolve()), **part.model_dump(exclude={"file"}, exclude_none=True)}
-    name = name_from(robot_name(file) or file.stem)
+    name = name_from(read_tree(file).name or file.stem)
     robot = checked_robot({"schema": "armident/robot/1", "name": name, **made}, str(file))
     robot = robot.with_urdf_facts(limit_places(file, [joint.source_name or joint.name for joint in robot.joints]))
     content: dict[str, Any] = {

@@ -43,7 +43,6 @@ def questionnaire(options: InitOptions, ask: Ask, tell: Callable[[str], None]) -
 
 
 def _source(source: str, ask: Ask) -> dict[str, Any]:
-    """Options of the source of the geometry."""
     suffix = Path(source).suffix.lower()
     if not source:
         return {"axes": _number(ask, "Number of joints", "6")}

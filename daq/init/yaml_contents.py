@@ -60,7 +60,6 @@ def robot_content(
 def _joint(
     entry: dict[str, Any], robot: RobotConfig, k: int, facts: RecordedFacts | None, signal: str | None, hinted: set[str]
 ) -> Any:
-    """Return one entry of ``joints``."""
     joint = robot.joints[k]
     made = {key: _blank(f"joints[].{key}", hinted) if value == MARK else value for key, value in entry.items()}
     if joint.limits.missing():

@@ -290,7 +290,6 @@ class RecordingWriter(AbstractContextManager["RecordingWriter", None]):
             self.flush()
 
     def _add_metadata(self, metadata: Metadata) -> bytes:
-        """Write a metadata record; return its bytes."""
         data = mcap.encode(metadata)
         index = MetadataIndex(self._position, len(data), metadata.name)
         self._append(data)

@@ -121,7 +121,6 @@ def simulate(
 
 
 def _robot_of(document: Path | None) -> "RobotConfig":
-    """Return the robot of an identification."""
     from armident.identify.identification.saved_model import load_model
 
     assert document is not None
