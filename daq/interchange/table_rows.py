@@ -113,7 +113,7 @@ def complete_rows(
 
 def _in_order(rows: TableRows) -> TableRows:
     """Return the rows from the oldest to the newest, and their times without wraps."""
-    if rows.times is None:
+    if rows.times is None or rows.times.size < 2:
         return rows
     notes: tuple[str, ...] = ()
     steps, order = np.diff(rows.times), np.argsort(rows.times)
