@@ -14,6 +14,7 @@ from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.daq.interchange.bag_files import bag_files
 from armident.daq.interchange.clocks import UNITS, descending, gaps_and_counters
 from armident.daq.interchange.column_units import SINCE
+from armident.daq.interchange.csv_files import seconds_of_date
 from armident.daq.interchange.exporting import CLOCK_SET_NS
 from armident.daq.interchange.import_options import ImportOptions
 from armident.daq.interchange.lerobot import FULL, UNSURE, data_files, position_hint
@@ -229,7 +230,10 @@ def _begin_ns(source: Source, rows: TableRows, stated: str | None) -> int:
     date = source.units.get(rows.time_name, "").partition(SINCE)[2]
     begin_ns = round(float(rows.times[0]) * UNITS.get(stated or rows.time_unit, 1.0) * 1e9)
     try:
-        begin_ns += int(np.datetime64(date.removesuffix("Z"), "ns").astype(np.int64)) if date else 0
+        if date.endswith("Z"):
+            begin_ns += int(np.datetime64(date[:-1], "ns").astype(np.int64))
+        elif date:
+            begin_ns += round(1e9 * (seconds_of_date(date) or 0.0))
     except ValueError:
         return 0
     return begin_ns if CLOCK_SET_NS <= begin_ns < 2**62 else 0
