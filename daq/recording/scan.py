@@ -15,7 +15,7 @@ from mcap.records import Channel, Metadata, Statistics
 from armident.configs import DataError
 from armident.daq.recording import mcap_records as mcap
 from armident.daq.recording.layout import StreamLayout
-from armident.daq.recording.names import CHECK, COUNTERS, LAYOUT_KEY, RECOVERED, ROWS_OF
+from armident.daq.recording.names import CHECK, COUNTERS, LAYOUT_KEY, RECORDING, RECOVERED, ROBOT, ROWS_OF, SESSION
 
 LARGEST_CHUNK = 1 << 28
 """Largest uncompressed chunk that is read, bytes."""
@@ -41,6 +41,8 @@ _IN_DATA = frozenset(
     )
 )
 """Opcodes that may precede the summary."""
+WRITTEN_ONCE = (RECORDING, ROBOT, SESSION)
+"""Metadata of which a file has one record: another content belongs to another recording."""
 
 
 class MessageRun(NamedTuple):
@@ -232,8 +234,10 @@ class RecordingScan:
                     crc = self._verified(metadata.metadata, at)
                     self.head_crc = crc if self.head_crc is None else self.head_crc
                 self.metadata[CHECK] = self.metadata.get(CHECK, {}) | metadata.metadata
-            else:
+            elif metadata.name not in WRITTEN_ONCE:
                 self.metadata[metadata.name] = metadata.metadata
+            elif self.metadata.setdefault(metadata.name, metadata.metadata) != metadata.metadata:
+                raise mcap.MalformedRecord(f"another {metadata.name} than at the start of the file")
             return metadata
         self.finished = opcode == Opcode.DATA_END
         return None
