@@ -167,14 +167,17 @@ class RecordingScan:
     def missing(self, last_sync: int | None) -> list[str]:
         """Return descriptions of missing parts after the iteration, by the SYNC of the last sample (``None``: none)."""
         words = list(self.damage)
-        if self.finished and not self.damage:
+        if self.rewritten and self.finished and COUNTERS not in self.metadata and RECOVERED not in self.metadata:
+            words.append(
+                "the recording was not finished when another tool rewrote it: its last rows and counters are missing"
+            )
+        if not self._part and (self.rewritten or (self.finished and not self.damage)):
+            left = self._by_topic(self.messages)
             words += [
-                f"{self.messages.get(k, 0)} messages of topic {self.channels[k].topic} where {count} were written"
-                for k, count in (self.expected or {}).items()
-                if k in self.channels and count != self.messages.get(k, 0)
+                f"{left.get(topic, 0)} of {count} messages of topic {topic} are left"
+                for topic, count in self._written()
+                if count != left.get(topic, 0)
             ]
-        if self.rewritten and not self._part:
-            words += self._lost_in_rewriting()
         if not self.finished:
             since = "from the start" if last_sync is None else f"after SYNC {last_sync}"
             words.append(
@@ -183,22 +186,23 @@ class RecordingScan:
             )
         return words
 
-    def _lost_in_rewriting(self) -> list[str]:
-        """Return descriptions of the parts that a recording had, or lacked, before another tool rewrote it."""
-        words = []
-        if self.finished and COUNTERS not in self.metadata and RECOVERED not in self.metadata:
-            words.append(
-                "the recording was not finished when another tool rewrote it: its last rows and counters are missing"
-            )
-        for key, value in self.metadata.get(CHECK, {}).items():
-            topic = key.removeprefix(ROWS_OF)
-            if topic != key and value.isdecimal():
-                found = sum(n for k, n in self.messages.items() if self.channels[k].topic == topic)
-                if found != int(value):
-                    words.append(
-                        f"{found} of {value} messages of topic {topic} are left since another tool rewrote the file"
-                    )
-        return words
+    def _written(self) -> list[tuple[str, int]]:
+        """Return topics and numbers of messages by the summary, and by the checksum record of a file not recovered."""
+        stated = {} if RECOVERED in self.metadata else self.metadata.get(CHECK, {})
+        rows = {
+            (key.removeprefix(ROWS_OF), int(value))
+            for key, value in stated.items()
+            if key.startswith(ROWS_OF) and value.isdecimal()
+        }
+        return sorted(rows | set(self._by_topic(self.expected or {}).items()))
+
+    def _by_topic(self, numbers: dict[int, int]) -> dict[str, int]:
+        """Return sums, by topic, of the numbers of messages by channel id; unknown channels are left out."""
+        sums: dict[str, int] = {}
+        for k, number in numbers.items():
+            if k in self.channels:
+                sums[self.channels[k].topic] = sums.get(self.channels[k].topic, 0) + number
+        return sums
 
     def _read_ahead(self, pool: ThreadPoolExecutor) -> Iterator[_Pending]:
         """Yield the records in file order, with the futures of the chunks."""
