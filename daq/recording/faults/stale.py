@@ -23,8 +23,8 @@ NEAR = 8
 SLOW = 0.2
 """Velocity over the usual one from which a joint moves."""
 
-OF_NOISE = -0.25
-"""Correlation of changes that follow each other below which an effort is noise from row to row: -0.5 if it is white."""
+OF_NOISE = -1.0 / 6.0
+"""Mean product of the signs of successive changes below which an effort is noise from row to row: -1/3 if white."""
 
 SPANNED = 0.6
 """Least share of renewed values of an effort in coarse steps whose noise, half a step or more, renews it anywhere."""
@@ -63,12 +63,12 @@ def frozen_efforts(effort: Array, position: Array, criteria: JumpCriteria) -> Ma
     moves = _moves(position)
     for j, x in enumerate(effort.T):
         change = np.diff(x)
-        step = np.abs(change)
+        step, sign = np.abs(change), np.sign(change)
         renewed = np.flatnonzero(step)
         if not renewed.size:
             continue
         wide = renewed.size > SPANNED * step.size or not resolution(x)
-        noisy = wide and float(change[1:] @ change[:-1]) < OF_NOISE * float(change @ change)
+        noisy = wide and float(sign[1:] @ sign[:-1]) < OF_NOISE * np.count_nonzero(sign[1:] * sign[:-1])
         jump = criteria.ratio * float(np.quantile(step, criteria.most))
         chance = np.log(max(1.0 - renewed.size / step.size, 1.0 / step.size))
         longest = max((np.log(MOST_CHANCE) - np.log(step.size)) / min(chance, -1e-12), LEAST_RUN)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.random import Generator
 from numpy.typing import NDArray
+from scipy import signal
 
 from armident.configs import DataError, RobotConfig, load_robot
 from armident.daq.interchange.importing import recording_of_arrays
@@ -138,8 +139,8 @@ def test_signals_that_are_not_renewed_are_left_out_while_they_are(tx40: RobotCon
     rows = np.arange(begin, begin + length)
     signals = [(q, tau), (q,), (tau,)][int(rng.integers(3))]
     joints = slice(None) if len(signals) == 2 or rng.random() < 0.5 else j
-    for signal in signals:
-        signal[rows, joints] = signal[begin - 1, joints]
+    for values in signals:
+        values[rows, joints] = values[begin - 1, joints]
     result = found(t, q, tau, tx40)
     assert result.wrong[rows].all()
     assert result.wrong.sum() <= length + 10  # the joint is back on its way soon after a freeze
@@ -156,6 +157,21 @@ def test_torques_in_coarse_steps_are_no_fault(tx40: RobotConfig) -> None:
         notes += found(t, q, np.rint(tau / step + rng.normal(0, noise, tau.shape)) * step, tx40).notes
     # a run of equal values is called a fault in one recording of a thousand, for each joint
     assert len(notes) <= 1
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_torques_without_noise_that_rest_between_two_counts_of_an_encoder_are_no_fault(
+    tx40: RobotConfig, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    t, q, _ = motion(rng, 5000.0, 4.0)
+    at_counts = np.zeros((t.size, 6))
+    for effort, seconds in zip(at_counts.T, 10 ** rng.uniform(-4, -3, 6), strict=True):
+        ticks = rng.random(t.size) < 0.1
+        effort[ticks] = rng.choice([-1.0, 1.0], ticks.sum())
+        effort[:] = signal.lfilter([1.0], [1.0, -np.exp(-2e-4 / seconds)], effort)
+    tau = np.rint((4.0 + np.sin(t)[:, None] + at_counts) / 2e-3) * 2e-3
+    assert found(t, q, tau, tx40).notes == ()
 
 
 @pytest.mark.parametrize("seed", range(5))
