@@ -28,7 +28,7 @@ from armident.configs import (
 )
 from armident.configs.blanks import blank_lines, needed, pattern
 from armident.configs.implausible import implausible_values
-from armident.configs.loading import is_session
+from armident.configs.loading import is_session, load_inertials
 from armident.configs.schema.session import Bus
 from armident.daq.capture.recording_files import chunk_duration_ns
 from armident.daq.identity.plant import of_session
@@ -78,7 +78,7 @@ def checks_for(config: str | Path, command: Command) -> list[Check]:
     missing = (*needed(of_session, command), *robot.blanks_for(command))
     checks = [Check("configuration", "ok", f"{config}: robot {robot.name}, {robot.n} joints")]
     checks += [Check("blank", "failed", line) for line in blank_lines(missing)]
-    checks += [Check("robot", "warning", line) for line in implausible_values(robot)]
+    checks += _robot(path if session is None else session.robot, robot)
     if command == "trajectory" and not missing:
         try:
             robot.check_movable(str(path))
@@ -108,7 +108,7 @@ def run_checks(config: str | Path) -> list[Check]:
     except ArmidentError as error:
         return [Check("configuration", "failed", str(error)), *_data_sheets(session), _installation(), _clock()]
     checks = [Check("configuration", "ok", f"{config}: cell {session.cell}, robot {robot.name}")]
-    checks += [Check("robot", "warning", line) for line in implausible_values(robot)]
+    checks += _robot(session.robot, robot)
     foreign = session.sync.role == "consumer" and not session.sync.counter
     phase = unknown_phase(session) if foreign else None
     if phase is not None:
@@ -119,6 +119,15 @@ def run_checks(config: str | Path) -> list[Check]:
     checks += [_installation(), _clock()]
     checks += [*_disk(session, robot), *_zenoh(session), *_metrics(session), *_keys(session)]
     return checks
+
+
+def _robot(path: str | Path, robot: RobotConfig) -> Iterator[Check]:
+    """Check the masses of the robot's URDF, and its values against those of known arms."""
+    try:
+        load_inertials(path)
+    except ConfigError as error:
+        yield Check("robot", "warning", str(error))
+    yield from (Check("robot", "warning", line) for line in implausible_values(robot))
 
 
 def _data_sheets(session: SessionConfig) -> Iterator[Check]:
@@ -353,10 +362,14 @@ def _zenoh(session: SessionConfig) -> Iterator[Check]:
 
 
 def _metrics(session: SessionConfig) -> Iterator[Check]:
-    """Check that the port of the metrics is free."""
+    """Check that the port of the metrics is free, and another than that of Zenoh."""
     options = session.metrics
     address = f"{options.address}:{options.port}"
-    if options.port and (reason := _taken(address)) is not None:
+    same = {address, f"0.0.0.0:{options.port}", f"[::]:{options.port}"}
+    both = [place for place in session.zenoh.listen if place.partition("/")[2] in same]
+    if options.port and both:
+        yield Check("metrics", "failed", f"metrics.port and zenoh.listen: both would listen at {both[0]}")
+    elif options.port and (reason := _taken(address)) is not None:
         yield Check("metrics", "failed", f"{address}: {reason}; is a capture running? metrics.port chooses another")
 
 
