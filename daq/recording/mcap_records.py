@@ -14,7 +14,7 @@ from typing import TypeVar
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Footer, McapRecord, Metadata, Statistics
+from mcap.records import Channel, ChunkIndex, Footer, Header, McapRecord, Metadata, Statistics
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -30,7 +30,7 @@ FOOTER_SIZE = RECORD_HEAD.size + _FOOTER_LENGTH
 
 COMPRESSION = "zstd"
 
-_Decoded = TypeVar("_Decoded", Channel, ChunkIndex, Footer, Metadata, Statistics)
+_Decoded = TypeVar("_Decoded", Channel, ChunkIndex, Footer, Header, Metadata, Statistics)
 
 
 class MalformedRecord(ValueError):

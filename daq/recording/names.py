@@ -5,6 +5,9 @@ from pathlib import Path
 SCHEMA = "armident/recording/1"
 """Version of the file's content, in the metadata record ``RECORDING``."""
 
+LIBRARY = "armident "
+"""Begin of the library in the header of a file, which another tool that rewrites it replaces by its own name."""
+
 GAPS_TOPIC, MARKS_TOPIC = "/events/gaps", "/events/marks"
 """Topics of gaps and marks, JSON."""
 

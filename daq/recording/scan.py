@@ -10,12 +10,22 @@ from typing import Any, NamedTuple
 import lz4.frame
 import zstandard
 from mcap.opcode import Opcode
-from mcap.records import Channel, Metadata, Statistics
+from mcap.records import Channel, Header, Metadata, Statistics
 
 from armident.configs import DataError
 from armident.daq.recording import mcap_records as mcap
 from armident.daq.recording.layout import StreamLayout
-from armident.daq.recording.names import CHECK, COUNTERS, LAYOUT_KEY, RECORDING, RECOVERED, ROBOT, ROWS_OF, SESSION
+from armident.daq.recording.names import (
+    CHECK,
+    COUNTERS,
+    LAYOUT_KEY,
+    LIBRARY,
+    RECORDING,
+    RECOVERED,
+    ROBOT,
+    ROWS_OF,
+    SESSION,
+)
 
 LARGEST_CHUNK = 1 << 28
 """Largest uncompressed chunk that is read, bytes."""
@@ -130,7 +140,7 @@ class RecordingScan:
         self.head_crc: int | None = None
         self.finished = self.rewritten = False
         self.end = 0
-        self._data, self._part = data, part
+        self._data, self._part, self._foreign = data, part, False
 
     def __iter__(self) -> Iterator[Item]:
         """Yield the records in file order, the data end last; MalformedRecord at a damaged head."""
@@ -233,7 +243,8 @@ class RecordingScan:
         if opcode == Opcode.METADATA:
             metadata = mcap.decode(Metadata, body)
             if metadata.name == CHECK:
-                self.rewritten = self.rewritten or (self.head_crc is None and self._is_moved(metadata.metadata, at))
+                moved = self._foreign and self.head_crc is None and self._is_moved(metadata.metadata, at)
+                self.rewritten = self.rewritten or moved
                 if not self.rewritten:
                     crc = self._verified(metadata.metadata, at)
                     self.head_crc = crc if self.head_crc is None else self.head_crc
@@ -243,6 +254,8 @@ class RecordingScan:
             elif self.metadata.setdefault(metadata.name, metadata.metadata) != metadata.metadata:
                 raise mcap.MalformedRecord(f"another {metadata.name} than at the start of the file")
             return metadata
+        if opcode == Opcode.HEADER:
+            self._foreign = not mcap.decode(Header, body).library.startswith(LIBRARY)
         self.finished = opcode == Opcode.DATA_END
         return None
 

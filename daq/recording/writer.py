@@ -31,6 +31,7 @@ from armident.daq.recording.names import (
     FACTS,
     GAPS_TOPIC,
     LAYOUT_KEY,
+    LIBRARY,
     MARKS_TOPIC,
     RECORDING,
     ROBOT,
@@ -128,7 +129,7 @@ class RecordingWriter(AbstractContextManager["RecordingWriter", None]):
     def _write_head(self, texts: Mapping[str, Mapping[str, str]]) -> None:
         """Write all records before the first chunk, then give the file its name."""
         try:
-            head = mcap.MAGIC + mcap.encode(Header("", f"armident {_version()}"))
+            head = mcap.MAGIC + mcap.encode(Header("", f"{LIBRARY}{_version()}"))
             head += b"".join(self._summary.schemas + self._summary.channels)
             self._append(head)
             for name, text in texts.items():
