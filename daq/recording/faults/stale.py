@@ -23,8 +23,8 @@ NEAR = 8
 SLOW = 0.2
 """Velocity over the usual one from which a joint moves."""
 
-OF_NOISE = -1.0 / 6.0
-"""Mean product of the signs of successive changes below which an effort is noise from row to row: -1/3 if white."""
+OF_NOISE, OF_SIGNS = -0.25, -1.0 / 6.0
+"""Correlation of successive changes, and of their signs, below which an effort is noise: white has -1/2 and -1/3."""
 
 SPANNED = 0.6
 """Least share of renewed values of an effort in coarse steps whose noise, half a step or more, renews it anywhere."""
@@ -68,7 +68,9 @@ def frozen_efforts(effort: Array, position: Array, criteria: JumpCriteria) -> Ma
         if not renewed.size:
             continue
         wide = renewed.size > SPANNED * step.size or not resolution(x)
-        noisy = wide and float(sign[1:] @ sign[:-1]) < OF_NOISE * np.count_nonzero(sign[1:] * sign[:-1])
+        # Rare large changes, as at the counts of an encoder, have the correlation of noise; their signs have not.
+        opposite = float(sign[1:] @ sign[:-1]) < OF_SIGNS * np.count_nonzero(sign[1:] * sign[:-1])
+        noisy = wide and opposite and float(change[1:] @ change[:-1]) < OF_NOISE * float(change @ change)
         jump = criteria.ratio * float(np.quantile(step, criteria.most))
         chance = np.log(max(1.0 - renewed.size / step.size, 1.0 / step.size))
         longest = max((np.log(MOST_CHANCE) - np.log(step.size)) / min(chance, -1e-12), LEAST_RUN)
