@@ -188,6 +188,8 @@ class RecordingScan:
                 for topic, count in self._written()
                 if count != left.get(topic, 0)
             ]
+        if self.finished and self.expected is None and not (self._part or self._foreign):
+            words.append("the summary at the end of the file is damaged: it does not tell if messages are missing")
         if not self.finished:
             since = "from the start" if last_sync is None else f"after SYNC {last_sync}"
             words.append(
