@@ -3,6 +3,7 @@
 import json
 import mmap
 import os
+import zlib
 from contextlib import suppress
 from dataclasses import dataclass, field
 from operator import itemgetter
@@ -23,14 +24,18 @@ from armident.daq.recording.model import Gap, Mark, Recording, Stream, gap_from,
 from armident.daq.recording.names import (
     CHECK,
     COUNTERS,
+    CRC_OF,
     FACTS,
     GAPS_TOPIC,
+    LAYOUT_KEY,
     MARKS_TOPIC,
     RECORDING,
     RECOVERED,
     ROBOT,
+    SAMPLE_RATE,
     SCHEMA,
     SESSION,
+    head_texts,
 )
 from armident.daq.recording.objects import ObjectUrl, located, opened
 from armident.daq.recording.scan import LARGEST_CHUNK, ChunkItem, RecordingScan
@@ -236,6 +241,7 @@ def _recording(path: Path, content: _Content) -> Recording:
         raise DataError(f"{path}: truncated before its first chunk, or its head is damaged")
     if head.get("schema") != SCHEMA:
         raise DataError(f"{path}: a recording of schema {head.get('schema')!r}, this version reads {SCHEMA}")
+    _check_head(path, scan)
     first = {layout.name: k for k, layout in reversed(scan.layouts.items())}
     streams = {
         name: _stream(content.rows_of(k), scan.layouts[k], scan.rewritten)
@@ -247,7 +253,7 @@ def _recording(path: Path, content: _Content) -> Recording:
         robot = RobotConfig.model_validate_json(scan.metadata[ROBOT]["json"])
         stored = scan.metadata.get(SESSION)
         session = SessionConfig.model_validate_json(stored["json"]) if stored else None
-        rate = float(head["sample_rate_hz"])
+        rate = float(head[SAMPLE_RATE])
         counters = {key: int(value) for key, value in scan.metadata.get(COUNTERS, {}).items()}
     except (KeyError, ValidationError, ValueError) as error:
         raise DataError(f"{path}: its configuration is invalid: {short_reason(error)}") from error
@@ -269,6 +275,15 @@ def _recording(path: Path, content: _Content) -> Recording:
         metadata=scan.metadata.get(FACTS, {}),
         missing="; ".join(missing) or None,
     )
+
+
+def _check_head(path: Path, scan: RecordingScan) -> None:
+    """Refuse a file with configurations, layouts or a rate that do not fit their own checksums."""
+    layouts = {c.topic: c.metadata[LAYOUT_KEY] for c in scan.channels.values() if LAYOUT_KEY in c.metadata}
+    for name, text in head_texts(scan.metadata, layouts).items():
+        stated = scan.metadata[RECORDING].get(f"{CRC_OF}{name}")
+        if stated not in (None, str(zlib.crc32(text.encode()))):
+            raise DataError(f"{path}: its head is damaged: wrong checksum of {name}")
 
 
 def _stream(rows: GrowingRows, layout: StreamLayout, rewritten: bool) -> Stream:

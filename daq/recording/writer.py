@@ -28,6 +28,7 @@ from armident.daq.recording.model import Gap, Mark, Recording
 from armident.daq.recording.names import (
     CHECK,
     COUNTERS,
+    CRC_OF,
     FACTS,
     GAPS_TOPIC,
     LAYOUT_KEY,
@@ -36,8 +37,10 @@ from armident.daq.recording.names import (
     RECORDING,
     ROBOT,
     ROWS_OF,
+    SAMPLE_RATE,
     SCHEMA,
     SESSION,
+    head_texts,
 )
 from armident.daq.recording.preview import PREFIX, PreviewChannel
 
@@ -86,11 +89,13 @@ class RecordingWriter(AbstractContextManager["RecordingWriter", None]):
         self._span: tuple[int, int] | None = None
         self._position = self._head_crc = 0
         texts = {
-            RECORDING: {"schema": SCHEMA, "sample_rate_hz": repr(sample_rate_hz), "check": CHECK},
+            RECORDING: {"schema": SCHEMA, SAMPLE_RATE: repr(sample_rate_hz), "check": CHECK},
             ROBOT: {"json": robot.model_dump_json(by_alias=True)},
             SESSION: {} if session is None else {"json": session.model_dump_json(by_alias=True)},
             FACTS: dict(metadata),
         }
+        heads = head_texts(texts, {layout.topic: layout.to_json() for layout in layouts})
+        texts[RECORDING] |= {f"{CRC_OF}{name}": str(zlib.crc32(text.encode())) for name, text in heads.items()}
         # Channel ids differ from file to file, so that a chunk of another file is noticed.
         first = 1 + zlib.crc32(repr(texts).encode()) % _MOST_CHANNELS
         self._layouts = {layout.name: (k, layout) for k, layout in enumerate(layouts, start=first)}
