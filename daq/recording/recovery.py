@@ -287,7 +287,7 @@ def _rewrite(path: Path, data: memoryview, found: _Contents) -> Path:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
     def moved(at: int) -> int:
-        return at - sum(cut.shift for cut in found.cuts if cut.start < at)
+        return at - sum(cut.shift for cut in found.cuts if cut.end <= at)
 
     def moved_chunk(index: ChunkIndex) -> ChunkIndex:
         start = moved(index.chunk_start_offset)

@@ -106,6 +106,8 @@ SCENARIOS = {
     "emps_dry_screw": "joint_1",
 }
 """Scenario and a joint that its findings name."""
+NEEDS_QUESTIONS = {"tx40_cable"}
+"""Scenarios that one run leaves doubtful: `armident investigate` asks the arm."""
 
 
 @pytest.mark.slow
@@ -114,7 +116,8 @@ SCENARIOS = {
 @pytest.mark.parametrize("robot", ["tx40", "emps"])
 def test_every_shipped_scenario_is_found_in_one_run(vcan_bus: str, tmp_path: Path, robot: str) -> None:
     """One healthy run, then one run of each scenario: exit code 4, and the findings name the joint."""
-    assert {path.stem for path in config_path("scenarios/tx40_miswired.yaml").parent.glob("*.yaml")} == SCENARIOS.keys()
+    shipped = {path.stem for path in config_path("scenarios/tx40_miswired.yaml").parent.glob("*.yaml")}
+    assert shipped - NEEDS_QUESTIONS == SCENARIOS.keys()
     config = cell_file(tmp_path, vcan_bus, f"scenarios_{robot}", shipped=f"{robot}_cell.yaml")
     with arm(config, "--seed", "1"):
         finished(job(config, tmp_path), 0)

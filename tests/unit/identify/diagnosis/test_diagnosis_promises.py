@@ -116,7 +116,10 @@ def test_like_joints_that_were_exchanged_are_found_though_nothing_else_is_amiss(
     both = {"position": 1.0, "torque": 1.0}
     exchanged = HiddenEffect(effect="joint_order", joint="joint_4", other="joint_5", parameters=both)
     document = diagnosis("tx40", "tx40_4", 5, exchanged, repeats=3).document
-    assert [(f.effect, f.joint, f.other) for f in document.findings] == [("joint_order", "joint_4", "joint_5")]
+    first, *others = document.findings
+    assert (first.effect, first.joint, first.other) == ("joint_order", "joint_4", "joint_5")
+    # At a probability of 0.7 the order is left as it is, and what it leaves unexplained has no name.
+    assert {f.effect for f in others} <= {"unnamed"}
 
 
 @pytest.mark.nightly
