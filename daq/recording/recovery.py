@@ -188,7 +188,8 @@ class _Contents:
         elif self._last is not None:
             self._last.damaged, self._last.end = True, item.end
         else:
-            self.cuts.append(_Cut(self._damage_start(item), item.end))
+            start = self._damage_start(item)
+            self.cuts = [cut for cut in self.cuts if cut.end <= start] + [_Cut(start, item.end)]
 
     def _damage_start(self, item: DamageItem) -> int:
         """Return the start of the cut for a damaged record: counters and their checksum are both left out."""
