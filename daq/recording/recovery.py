@@ -188,16 +188,15 @@ class _Contents:
         elif self._last is not None:
             self._last.damaged, self._last.end = True, item.end
         else:
-            start = self._damage_start(item)
-            self.cuts = [cut for cut in self.cuts if cut.end <= start] + [_Cut(start, item.end)]
+            if item.opcode == Opcode.METADATA:
+                self._leave_out_counters()
+            self.cuts = sorted([*self.cuts, _Cut(item.start, item.end)], key=lambda cut: cut.start)
 
-    def _damage_start(self, item: DamageItem) -> int:
-        """Return the start of the cut for a damaged record: counters and their checksum are both left out."""
-        counters = [index.offset for index in self.summary.metadata if index.name == COUNTERS]
-        if item.opcode != Opcode.METADATA or not counters:
-            return item.start
-        self.summary.metadata = [index for index in self.summary.metadata if index.offset < counters[0]]
-        return counters[0]
+    def _leave_out_counters(self) -> None:
+        """Cut the counters, whose checksum is damaged or may be."""
+        counters = [index for index in self.summary.metadata if index.name == COUNTERS]
+        self.summary.metadata = [index for index in self.summary.metadata if index.name != COUNTERS]
+        self.cuts += [_Cut(index.offset, index.offset + index.length) for index in counters]
 
     def _add_message_index(self, item: RecordItem, content: MessageIndexContent) -> None:
         if self._after_damaged_chunk:
