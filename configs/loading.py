@@ -231,7 +231,7 @@ def load_session(name: str | Path, command: str | None = None) -> SessionConfig:
         target = base / relative
         found = target if is_file(target) else _shipped(relative, (folder,))
         if found is None:
-            raise ConfigError(f"{path}: {key}: no such file {relative} (looked for {target})")
+            raise ConfigError(f"{path}: {key}: no such file {relative!s:.400} (looked for {target!s:.400})")
         return found
 
     changes: dict[str, Any] = {

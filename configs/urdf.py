@@ -116,7 +116,7 @@ def urdf_file(given: UrdfGeometry, where: Path) -> Path:
     """Path of the URDF of a robot configuration; raises ConfigError if there is no such file."""
     file = where.resolve().parent / given.urdf.file
     if not is_file(file):
-        raise ConfigError(f"{where}: urdf.file: no such file {given.urdf.file} (looked for {file})")
+        raise ConfigError(f"{where}: urdf.file: no such file {given.urdf.file!s:.400} (looked for {file!s:.400})")
     return file
 
 
