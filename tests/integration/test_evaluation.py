@@ -147,8 +147,8 @@ LEAST = {
     "effect and joint correct": 0.70,
     "effect and joint correct, first or second choice": 0.70,
     "healthy arms with verdict no_gap": 1.0,
-    "mean closed share of the injected gap where the effect is correct": 0.85,
-    "cases with at least 90% of the gap closed": 0.60,
+    "mean closed share of the injected gap where the effect is correct": 0.55,
+    "cases with at least 90% of the gap closed": 0.45,
     "parameters within three standard deviations": 0.70,
 }
 """Limits for the quick subset (one run per effect): two binomial standard deviations below its results or more."""
