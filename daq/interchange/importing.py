@@ -230,7 +230,7 @@ def _begin_ns(source: Source, rows: TableRows, stated: str | None) -> int:
     date = source.units.get(rows.time_name, "").partition(SINCE)[2]
     begin_ns = round(float(rows.times[0]) * UNITS.get(stated or rows.time_unit, 1.0) * 1e9)
     try:
-        if date.endswith("Z"):
+        if date.endswith("Z") and seconds_of_date(date) is not None:
             begin_ns += int(np.datetime64(date[:-1], "ns").astype(np.int64))
         elif date:
             begin_ns += round(1e9 * (seconds_of_date(date) or 0.0))
