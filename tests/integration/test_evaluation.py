@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -147,24 +148,33 @@ LEAST = {
     "effect and joint correct": 0.70,
     "effect and joint correct, first or second choice": 0.70,
     "healthy arms with verdict no_gap": 1.0,
-    "mean closed share of the injected gap where the effect is correct": 0.55,
-    "cases with at least 90% of the gap closed": 0.45,
+    "cases with at least 90% of the gap closed": 0.60,
     "parameters within three standard deviations": 0.70,
 }
 """Limits for the quick subset (one run per effect): two binomial standard deviations below its results or more."""
 
 
-@pytest.mark.nightly
-def test_most_of_the_quick_subset_is_named_and_no_healthy_arm_is_blamed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    done = suite("--quick", "--out", str(tmp_path))
-    with capsys.disabled():
-        print(done.stdout, file=sys.__stderr__)
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Summary of the quick subset."""
+    out = tmp_path_factory.mktemp("quick")
+    done = suite("--quick", "--out", str(out))
     assert done.returncode == 0, done.stderr
-    result = json.loads((tmp_path / SUMMARY).read_text(encoding="utf-8"))
-    assert result["not_run"] == 0
+    result = json.loads((out / SUMMARY).read_text(encoding="utf-8"))
     assert f"{result['run']} of {result['run']} cases" in done.stdout
-    reached = {aim["what"]: aim["value"] for aim in result["aims"]}
+    return result
+
+
+@pytest.mark.nightly
+def test_most_of_the_quick_subset_is_named_and_no_healthy_arm_is_blamed(quick: Any) -> None:
+    assert quick["not_run"] == 0
+    reached = {aim["what"]: aim["value"] for aim in quick["aims"]}
     assert {what: reached[what] for what, least in LEAST.items() if reached[what] < least} == {}
-    assert sum(row["n"] for row in result["healthy"] if row["label"].endswith(", all")) >= 12
+    assert sum(row["n"] for row in quick["healthy"] if row["label"].endswith(", all")) >= 12
+
+
+@pytest.mark.nightly
+@pytest.mark.xfail(strict=True, reason="closes 72 %: small effects close little of their gap beside the noise")
+def test_the_gap_of_the_quick_subset_is_closed(quick: Any) -> None:
+    closed = "mean closed share of the injected gap where the effect is correct"
+    assert next(aim["value"] for aim in quick["aims"] if aim["what"] == closed) >= 0.85

