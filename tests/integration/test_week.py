@@ -23,10 +23,10 @@ ODD = ("half", "replaced", "deleted", "copy", "other cell", "bomb", "damaged", "
 def test_every_file_has_one_result_or_one_reason_and_every_result_one_announcement(
     tmp_path: Path, minutes: float, faults: tuple[str, ...], odd: tuple[str, ...]
 ) -> None:
-    report = run(minutes, 1, tmp_path, 10.0 * minutes**0.5, faults, odd)
+    report = run(minutes, 1, tmp_path, 10.0, faults, odd)
     assert report["wrong"] == []
     assert report["audit"]["files with one result"] > 8 * minutes
     assert report["audit"]["files with one reason"] > 0
-    assert len(report["faults"]) > 2.0 * minutes**0.5  # a third of those that are planned, on a busy machine
+    assert len(report["faults"]) > 2 * minutes
     # Nobody but the plant has been believed, and its listener has been there.
     assert sum(report["audit"][f"heard {how}"] for how in ("once", "again", "not, told when asked")) > 8 * minutes
